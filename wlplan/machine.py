@@ -1,0 +1,96 @@
+"""Parameters of the machine and of the soil, as frozen presets.
+
+Every number carries its source on the line above; "estimate" means that no source was found and
+the value was chosen by us. The calibrated group of `Soil` is fitted, see docs/simulator.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+
+@dataclasses.dataclass(frozen=True)
+class WheelLoader:
+    """A wheel loader of the Komatsu WA320-7 class with its bucket, linkage and drive line."""
+
+    # Operating mass [kg]. Manufacturer's brochure: 15.2 t.
+    mass: float = 15_200.0
+    # Approach and reverse speed [m/s]. Paper, section 4.2: 8 km/h.
+    travel_speed: float = 8.0 / 3.6
+    # Distance from the dig location at which a cycle starts and ends [m]. Paper, section 4.2.
+    approach_distance: float = 5.0
+    # Tyre friction on firm gravel [1]. Estimate, 0.6 to 0.75 in the literature.
+    traction: float = 0.6
+    # Rolling resistance coefficient on a firm gravel floor [1]. Estimate.
+    rolling_resistance: float = 0.03
+    # Power at the wheels while digging [W]; the net engine power is 124 kW (brochure) and is
+    # shared with the hydraulics. Estimate.
+    wheel_power: float = 80_000.0
+    # Gain of the travel speed controller [N s/m]. Estimate: stiff, force-limited.
+    speed_gain: float = 1.0e5
+    # Upper bound on the slip speed that is counted as work [m/s]. Estimate: the operator's
+    # traction control lets the wheels slip by about a third of the travel speed.
+    slip_speed: float = 0.75
+    # Mass of the bucket, and of the boom (half of which acts at the pin) [kg]. Estimate.
+    bucket_mass: float = 1300.0
+    boom_mass: float = 1100.0
+
+    # Bucket width [m]. Brochure: 2.6 to 2.74 m over the range of buckets.
+    bucket_width: float = 2.70
+    # Length of the bucket floor from the cutting edge to the back wall [m]. Estimate from the
+    # brochure's side view.
+    bucket_depth: float = 1.10
+    # Struck volume with the bucket level, and heaped volume when fully tilted [m^3]. Brochure:
+    # 2.3 to 2.7 struck, about 3.0 to 3.2 heaped.
+    bucket_struck: float = 2.3
+    bucket_heaped: float = 3.0
+    # Height of the boom pivot above the ground [m], and boom length to the bucket pin [m].
+    # Brochure drawing: 1.9 to 1.95 and 2.6 to 2.7.
+    pivot_height: float = 1.90
+    boom_length: float = 2.70
+    # Distance from the bucket pin to the cutting edge [m]. Brochure drawing.
+    tip_radius: float = 1.25
+    # Boom angle with the bucket on the ground, and at the end of the cycle [rad]. Paper: -20.
+    boom_low: float = math.radians(-37.0)
+    boom_carry: float = math.radians(-20.0)
+    # Highest boom angle [rad]. Estimate from the brochure's dumping height.
+    boom_high: float = math.radians(45.0)
+    # Bucket angle at the tilt end [rad]. Brochure: 48 at the carry position.
+    tilt_end: float = math.radians(48.0)
+    # Full boom speed [rad/s]: the stroke of 82 degrees in 5.9 s (brochure).
+    boom_speed: float = math.radians(82.0) / 5.9
+    # Full tilt speed [rad/s]. Estimate: 36 degrees a second.
+    tilt_speed: float = math.radians(36.0)
+    # Lever arm of the boom cylinders about the pivot [m] and their stall force [N]. Estimate.
+    boom_lever: float = 0.5
+    boom_force: float = 600_000.0
+    # Boom force that normalises the controller's thresholds, f_b0 [N]. Estimate.
+    boom_force_nominal: float = 500_000.0
+    # Largest tilting moment of the bucket cylinder about the pin [N m]. Breakout force 130 to
+    # 145 kN (brochure) at the tip radius is 163 to 181 kN m at the cutting edge.
+    tilt_moment: float = 175_000.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Soil:
+    """A homogeneous soil."""
+
+    # Bulk density [kg/m^3], internal friction [rad], cohesion [Pa], dilatancy [rad]. Dry gravel:
+    # paper, section 4.1.
+    density: float = 1727.0
+    friction: float = math.radians(32.0)
+    cohesion: float = 0.0
+    dilatancy: float = math.radians(8.0)
+    # Soil-steel friction [rad] and adhesion [Pa]. Estimate: two thirds of the internal friction.
+    steel_friction: float = math.radians(20.0)
+    adhesion: float = 0.0
+
+    @property
+    def repose_angle(self) -> float:
+        """Angle of repose [rad]; of a cohesionless soil it is the internal friction angle."""
+        return self.friction
+
+
+WA320 = WheelLoader()
+GRAVEL = Soil()

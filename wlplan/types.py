@@ -1,0 +1,128 @@
+"""The pytrees that every stage shares, and the one signature that joins them.
+
+Frames: the world frame has x east, y north, z up. The local frame of a pose has e_x along the
+heading and e_y to its left. Everything is SI except `Performance`, which is in tonne and kJ as in
+the paper. Array leaves are batched by `jax.vmap`; nothing in here does arithmetic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, no_type_check
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+# JAX rebuilds pytrees with tracers, shapes or None inside, so these classes opt out of runtime
+# shape checking; the functions that take them are checked.
+
+
+@no_type_check
+@struct.dataclass
+class Pile:
+    """Heights of a pile and the terrain around it on a square grid, world frame.
+
+    Cell `[i, j]` is centred at x = origin[0] + i * cell_size, y = origin[1] + j * cell_size.
+    """
+
+    height: Float[Array, "*batch nx ny"]  # surface [m]
+    cell_size: float = struct.field(pytree_node=False)  # grid spacing [m]
+    origin: Float[Array, "*batch 2"] = (0.0, 0.0)  # centre of cell [0, 0] [m]
+    ground: Float[Array, "*batch nx ny"] | None = None  # floor under the pile [m]; None: level 0
+    valid: Bool[Array, "*batch nx ny"] | None = None  # cells the scan saw; None: all of them
+
+    def __post_init__(self):
+        # Users write plain tuples and lists; tracers and placeholders pass through untouched.
+        if isinstance(self.origin, tuple | list) and all(
+            isinstance(value, int | float | np.number) for value in self.origin
+        ):
+            object.__setattr__(self, "origin", jnp.asarray(self.origin, dtype=float))
+        for name in ("height", "ground", "valid"):
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray | list):
+                object.__setattr__(self, name, jnp.asarray(value))
+
+
+@no_type_check
+@struct.dataclass
+class Pose:
+    """A dig location at the toe of the pile and the heading into the pile, world frame."""
+
+    x: Float[Array, "*batch"]  # [m]
+    y: Float[Array, "*batch"]  # [m]
+    heading: Float[Array, "*batch"]  # [rad], counter-clockwise from +x
+
+
+@no_type_check
+@struct.dataclass
+class Action:
+    """Parameters of the automatic bucket-filling controller. Paper, section 4.2."""
+
+    delta_bm: Float[Array, "*batch"]  # boom force threshold [1], 0..0.7
+    k_bm: Float[Array, "*batch"]  # boom velocity gain [1], 0..5
+    delta_bk: Float[Array, "*batch"]  # bucket force threshold [1], 0..0.7
+    k_bk: Float[Array, "*batch"]  # bucket velocity gain [1], 0..5
+
+
+@no_type_check
+@struct.dataclass
+class Performance:
+    """What one loading yields and costs. Paper, section 5.1."""
+
+    mass: Float[Array, "*batch"]  # [tonne]
+    time: Float[Array, "*batch"]  # [s]
+    work: Float[Array, "*batch"]  # [kJ]
+
+
+@no_type_check
+@struct.dataclass
+class Characteristics:
+    """The four local pile characteristics of the low-dimensional model. Paper, section 3.3."""
+
+    slope: Float[Array, "*batch"]  # theta [rad]
+    incidence: Float[Array, "*batch"]  # alpha [rad], 0 head-on
+    curvature_x: Float[Array, "*batch"]  # kappa_x [1/m], convex positive
+    curvature_y: Float[Array, "*batch"]  # kappa_y [1/m], convex positive
+
+
+@no_type_check
+@struct.dataclass
+class LocalHeightmap:
+    """Heights in the local frame of a pose, relative to the first point of the centre line.
+
+    Cell `[i, j]` lies i * cell_size - displacement along the heading and
+    (j - (n - 1) / 2) * cell_size to its left.
+    """
+
+    height: Float[Array, "*batch n n"]  # [m]
+    cell_size: float = struct.field(pytree_node=False)  # [m]
+    displacement: float = struct.field(pytree_node=False)  # delta, towards the approach [m]
+
+
+@no_type_check
+@struct.dataclass
+class LoadingPlan:
+    """N loadings in order; every leaf has the leading axis N."""
+
+    pose: Pose
+    action: Action
+
+
+@no_type_check
+@struct.dataclass
+class Rollout:
+    """The outcome of a plan."""
+
+    performance: Performance  # per loading, leaves (N,)
+    pile: Pile  # after the last loading
+
+
+World = Callable[[Pile, Pose, Action], tuple[Pile, Performance]]
+"""`world(pile, pose, action) -> (pile_after, performance)`: a simulator or a learned model.
+
+The pile after has the same grid, ground and mask as the pile before.
+"""
+
+PyTree = Any
