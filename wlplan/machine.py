@@ -86,6 +86,21 @@ class Soil:
     steel_friction: float = math.radians(20.0)
     adhesion: float = 0.0
 
+    # Fitted to the forces and loads of discrete-element cycles, see docs/simulator.md.
+    # Factor on the earthmoving force [1].
+    force_scale: float = 1.0
+    # Inclination of the wedge of soil that rests against the bucket's back wall and acts as the
+    # blade once the bucket is full [rad].
+    wall_inclination: float = math.radians(45.0)
+    # Fullness of the bucket at which that wedge is complete [1].
+    wall_fullness: float = 0.6
+    # Resistance to the cutting edge a metre of width: at the surface [N/m] and as a multiple of
+    # the overburden pressure at its depth [m].
+    edge_resistance: float = 1_000.0
+    edge_bearing: float = 0.3
+    # Fastest flow of sliding soil a metre of width while the bucket digs [m^2/s].
+    slide_rate: float = 0.1
+
     @property
     def repose_angle(self) -> float:
         """Angle of repose [rad]; of a cohesionless soil it is the internal friction angle."""

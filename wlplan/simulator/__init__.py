@@ -1,0 +1,6 @@
+"""The simulator: a loading cycle of a wheel loader on a heightfield. Paper, section 4."""
+
+from wlplan.simulator.cycle import STOP_REASONS, Cycle, Settings, dig
+from wlplan.simulator.world import Simulator
+
+__all__ = ["STOP_REASONS", "Cycle", "Settings", "Simulator", "dig"]

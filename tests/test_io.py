@@ -1,0 +1,610 @@
+"""Round trips of scans and plans, and one clear line for every file that cannot be used."""
+
+import json
+import math
+import os
+import struct
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from wlplan import io
+from wlplan.errors import InputError
+from wlplan.pile import seed_pile, toe_contour, volume
+from wlplan.types import Action, LoadingPlan, Performance, Pose
+
+SLOPE = math.radians(30.0)
+
+
+@pytest.fixture
+def pile():
+    return seed_pile("conical", slope=SLOPE, height=2.0, seed=1)
+
+
+@pytest.fixture
+def fields(pile):
+    """What a valid .npz holds."""
+    return {"height": np.asarray(pile.height), "cell_size": 0.1, "origin": np.asarray(pile.origin)}
+
+
+def save(path, fields):
+    np.savez(path, **fields)
+    return path
+
+
+def refused(path, match, **arguments):
+    """Check that reading a pile fails with one line that names the file."""
+    with pytest.raises(InputError, match=match) as error:
+        io.read_pile(path, **arguments)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+    return str(error.value)
+
+
+def points_of(pile, random, n=60_000):
+    """A point cloud of a pile: random places, bilinear would be overkill for what is tested."""
+    i, j = (random.integers(0, size, n) for size in pile.height.shape)
+    x, y = (np.asarray(pile.origin)[axis] + 0.1 * k for axis, k in ((0, i), (1, j)))
+    return np.stack([x, y, np.asarray(pile.height)[i, j]], axis=-1).astype(np.float64)
+
+
+# --- the bundled pile
+
+
+def test_the_bundled_pile_is_read_with_its_ground():
+    pile = io.read_pile(io.bundled_pile_path())
+    assert pile.cell_size == 0.1
+    assert pile.height.shape == pile.ground.shape == pile.valid.shape == (190, 160)
+    assert (pile.ground <= pile.height).all()
+    assert 130.0 < volume(pile) < 200.0
+    contour = toe_contour(pile)
+    assert 40.0 < contour.length < 60.0
+    assert contour.accessible.sum() > 300
+
+
+def test_the_bundled_pile_ships_with_its_provenance():
+    page = io.bundled_pile_path().with_suffix(".md").read_text()
+    assert "LeoRover/leo_simulator" in page
+    assert "MIT" in page
+
+
+# --- npz
+
+
+def test_a_written_pile_reads_back_the_same(tmp_path, pile):
+    valid = np.ones(pile.height.shape, bool)
+    valid[:5] = False
+    pile = pile.replace(valid=jnp.asarray(valid), ground=pile.height * 0.1)
+    io.write_pile(tmp_path / "pile.npz", pile)
+    again = io.read_pile(tmp_path / "pile.npz")
+    for name in ("height", "ground", "valid", "origin"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(pile, name))
+    assert again.cell_size == pile.cell_size
+
+
+def test_level_ground_comes_out_as_zero(tmp_path, fields):
+    assert not io.read_pile(save(tmp_path / "pile.npz", fields)).ground.any()
+
+
+def test_a_map_without_a_pile_is_read(tmp_path, fields):
+    fields["height"] = np.zeros((60, 60))
+    pile = io.read_pile(save(tmp_path / "pile.npz", fields))
+    with pytest.raises(InputError, match="Nothing to dig"):
+        toe_contour(pile)
+
+
+def test_a_map_of_another_spacing_is_resampled(tmp_path, fields):
+    fields["cell_size"] = 0.25
+    pile = io.read_pile(save(tmp_path / "pile.npz", fields))
+    assert pile.cell_size == 0.1
+    want = float(np.sum(fields["height"])) * 0.25**2
+    assert volume(pile) == pytest.approx(want, rel=0.01)
+
+
+def test_unseen_cells_may_hold_anything_and_are_filled(tmp_path, fields):
+    height = fields["height"]
+    valid = np.ones(height.shape, bool)
+    valid[20:24, 30:40] = valid[60, 60:62] = valid[5, 5] = False
+    broken = height.copy()
+    broken[20:24, 30:40], broken[60, 60], broken[5, 5] = np.nan, np.inf, -9999.0
+    broken[60, 61] = kept = 0.5 * height.max()
+    fields.update(height=broken, valid=valid)
+    pile = io.read_pile(save(tmp_path / "pile.npz", fields))
+    np.testing.assert_array_equal(pile.valid, valid)
+    np.testing.assert_array_equal(np.asarray(pile.height)[valid], height[valid])
+    assert pile.height[60, 61] == pytest.approx(kept)  # a plausible fill is kept
+    np.testing.assert_allclose(pile.height, height, atol=0.7)
+
+
+def test_the_ground_of_the_file_is_used_unless_one_is_passed(tmp_path, fields):
+    fields["ground"] = np.full(fields["height"].shape, -0.25)
+    path = save(tmp_path / "pile.npz", fields)
+    np.testing.assert_array_equal(io.read_pile(path).ground, -0.25)
+    np.testing.assert_array_equal(io.read_pile(path, ground=-1.0).ground, -1.0)
+    lower = fields["height"] - 0.5
+    np.testing.assert_allclose(io.read_pile(path, ground=lower).ground, lower, atol=1e-6)
+    above = io.read_pile(path, ground=1.0)
+    assert (above.ground <= above.height).all()
+
+
+def test_survey_coordinates_keep_their_last_digits(tmp_path, fields):
+    fields["origin"] = np.array([431_012.25, 6_512_503.5])
+    fields["height"] = fields["height"].astype(np.float64) + 1234.5
+    fields["ground"] = np.full(fields["height"].shape, 1234.5)
+    pile = io.read_pile(save(tmp_path / "pile.npz", fields))
+    np.testing.assert_allclose(pile.origin, [12.25, 503.5])
+    assert float(pile.height.min()) == pytest.approx(34.5)
+    np.testing.assert_allclose(pile.ground, 34.5)
+
+
+def without(name):
+    return lambda fields: fields.pop(name)
+
+
+def setting(name, value):
+    return lambda fields: fields.update({name: value})
+
+
+def nan_in(name):
+    def change(fields):
+        fields[name] = fields.get(name, np.zeros(fields["height"].shape)).copy()
+        fields[name][3, 4] = np.nan
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (without("height"), "no field `height`"),
+        (without("cell_size"), "no field `cell_size`"),
+        (setting("cell_size", -0.1), "positive"),
+        (setting("cell_size", 0.0), "positive"),
+        (setting("cell_size", np.nan), "positive"),
+        (setting("cell_size", np.inf), "positive"),
+        (setting("cell_size", np.array([0.1, 0.1])), "one number"),
+        (setting("cell_size", "0.1"), "real numbers"),
+        (setting("cell_size", 0.01), "too small for a bucket"),
+        (setting("cell_size", 10.0), "may have 4000 cells"),
+        (setting("height", np.zeros((3, 50))), "too small for a bucket"),
+        (setting("height", np.zeros((0, 50))), "too small for a bucket"),
+        (setting("height", np.zeros(100)), "2-D"),
+        (setting("height", np.zeros((50, 50, 1))), "2-D"),
+        (setting("height", np.zeros((4001, 41), np.int8)), "may have 4000 cells"),
+        (setting("height", np.zeros((50, 50), complex)), "real numbers"),
+        (setting("height", np.full((50, 50), "a")), "real numbers"),
+        (setting("height", np.full((50, 50), None)), "cannot be read"),  # would need pickle
+        (nan_in("height"), "1 cells that count as seen"),
+        (setting("height", np.full((50, 50), np.inf)), "2500 cells that count as seen"),
+        (setting("valid", np.ones((5, 5), bool)), "`valid` has shape"),
+        (setting("valid", np.full((111, 111), 7)), "`valid`"),
+        (setting("ground", np.zeros((5, 5))), "`ground` has shape"),
+        (setting("ground", np.zeros(5)), "`ground` has shape"),
+        (nan_in("ground"), "`ground` is NaN"),
+        (setting("origin", np.zeros(3)), "`origin`"),
+        (setting("origin", np.array([0.0, np.nan])), "`origin`"),
+        (setting("origin", np.array(["a", "b"])), "`origin`"),
+    ],
+)
+def test_bad_fields_are_refused(tmp_path, fields, change, match):
+    change(fields)
+    refused(save(tmp_path / "pile.npz", fields), match)
+
+
+def test_a_map_that_was_not_seen_is_refused(tmp_path, fields):
+    fields["valid"] = np.zeros(fields["height"].shape, bool)
+    refused(save(tmp_path / "pile.npz", fields), "no cell counts as seen")
+
+
+def test_valid_may_be_zeros_and_ones(tmp_path, fields):
+    fields["valid"] = np.ones(fields["height"].shape, np.uint8)
+    fields["valid"][0, 0] = 0
+    assert not io.read_pile(save(tmp_path / "pile.npz", fields)).valid[0, 0]
+
+
+def test_missing_files_folders_and_strange_names_are_refused(tmp_path):
+    refused(tmp_path / "none.npz", "no such pile file")
+    (tmp_path / "folder.npz").mkdir()
+    refused(tmp_path / "folder.npz", "is a folder")
+    refused(tmp_path / ("n" * 300 + ".npz"), "no such pile file")
+    for name in ("pile.txt", "pile"):
+        (tmp_path / name).write_text("x")
+        refused(tmp_path / name, "unknown kind of pile file")
+
+
+def test_a_single_array_is_refused(tmp_path, fields):
+    with (tmp_path / "pile.npz").open("wb") as file:
+        np.save(file, fields["height"])
+    refused(tmp_path / "pile.npz", "single array")
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"not a zip at all", bytes(1000)])
+@pytest.mark.parametrize("ending", [".npz", ".tif", ".las", ".laz", ".ply"])
+def test_files_of_something_else_are_refused(tmp_path, content, ending, capfd):
+    if ending in (".las", ".laz"):
+        pytest.importorskip("laspy")
+    if ending == ".tif":
+        pytest.importorskip("rasterio")
+    path = tmp_path / f"pile{ending}"
+    path.write_bytes(content)
+    refused(path, "")
+    assert capfd.readouterr() == ("", "")
+
+
+def damaged(content, random):
+    """Copies of a file that are cut short or have some bytes changed."""
+    for share in (0.1, 0.5, 0.9, 0.99):
+        yield content[: int(share * len(content))]
+    for _ in range(30):
+        changed = bytearray(content)
+        for place in random.integers(0, len(content), 4):
+            changed[place] = random.integers(0, 256)
+        yield bytes(changed)
+    for _ in range(20):  # the headers are where it hurts
+        changed = bytearray(content)
+        for place in random.integers(0, min(len(content), 400), 3):
+            changed[place] = random.integers(0, 256)
+        yield bytes(changed)
+
+
+def check_damage(path, capfd):
+    content, refusals = path.read_bytes(), 0
+    for broken in damaged(content, np.random.default_rng(0)):
+        path.write_bytes(broken)
+        try:
+            io.read_pile(path)
+        except InputError as error:
+            assert "\n" not in str(error)
+            refusals += 1
+    assert refusals >= 4
+    assert capfd.readouterr() == ("", "")
+
+
+def test_damaged_npz_files_are_refused_or_read_but_never_crash(tmp_path, fields, capfd):
+    fields["height"] = fields["height"][20:80, 20:80]
+    np.savez_compressed(tmp_path / "pile.npz", **fields)
+    check_damage(tmp_path / "pile.npz", capfd)
+
+
+# --- GeoTIFF
+
+
+def write_tif(path, band, *, step=0.1, west=100.0, north=200.0, **options):
+    rasterio = pytest.importorskip("rasterio")
+    transform = options.pop("transform", rasterio.Affine(step, 0.0, west, 0.0, -step, north))
+    profile = {
+        "driver": "GTiff",
+        "count": 1,
+        "dtype": band.dtype,
+        "transform": transform,
+        **options,
+    }
+    with rasterio.open(path, "w", height=band.shape[0], width=band.shape[1], **profile) as file:
+        file.write(band, 1)
+    return path
+
+
+def test_geotiff_rows_run_from_north_to_south(tmp_path, pile):
+    height = np.asarray(pile.height)
+    height = height + 0.001 * np.arange(height.shape[1])  # not the same in x and y
+    west, south = 100.0, 200.0
+    north = south + 0.1 * height.shape[1]
+    path = write_tif(tmp_path / "pile.tif", height.T[::-1], west=west, north=north)
+    again = io.read_pile(path)
+    np.testing.assert_allclose(again.height, height, atol=1e-6)
+    np.testing.assert_allclose(again.origin, [west + 0.05, south + 0.05], atol=1e-4)
+    assert again.valid is None
+
+
+def test_geotiff_that_runs_from_south_to_north(tmp_path, pile):
+    rasterio = pytest.importorskip("rasterio")
+    band = np.asarray(pile.height)
+    upward = rasterio.Affine(0.1, 0.0, 100.0, 0.0, 0.1, 200.0)
+    again = io.read_pile(write_tif(tmp_path / "pile.tiff", band.T.copy(), transform=upward))
+    np.testing.assert_allclose(again.height, band, atol=1e-6)
+    np.testing.assert_allclose(again.origin, [100.05, 200.05], atol=1e-4)
+
+
+def test_geotiff_nodata_and_nan_are_unseen(tmp_path, pile):
+    band = np.asarray(pile.height).T.copy()
+    band[10, 20:30], band[12, 5] = -9999.0, np.nan
+    again = io.read_pile(write_tif(tmp_path / "pile.tif", band, nodata=-9999.0))
+    assert int(np.sum(~np.asarray(again.valid))) == 11
+    assert float(again.height.min()) == 0.0
+
+
+def test_geotiff_in_survey_coordinates(tmp_path, pile):
+    band = np.asarray(pile.height).T + np.float32(64.0)
+    path = write_tif(tmp_path / "p.tif", band, west=431_000.0, north=6_512_900.0, crs="EPSG:32633")
+    again = io.read_pile(path)
+    np.testing.assert_allclose(again.origin, [0.05, 900.0 - 0.1 * len(band) + 0.05], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"crs": "EPSG:4326"}, "metres"),
+        ({"crs": "EPSG:2263"}, "metres"),  # US survey feet
+        ({"transform": (0.1, 0.0, 0.0, 0.0, -0.2, 0.0)}, "square"),
+        ({"transform": (0.1, 0.02, 0.0, 0.02, -0.1, 0.0)}, "square"),
+        ({"transform": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)}, "no georeference"),
+        ({"step": 50.0}, "4000 cells"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_geotiffs_without_square_metric_cells_are_refused(tmp_path, pile, options, match):
+    rasterio = pytest.importorskip("rasterio")
+    if "transform" in options:
+        options = {**options, "transform": rasterio.Affine(*options["transform"])}
+    refused(write_tif(tmp_path / "pile.tif", np.asarray(pile.height), **options), match)
+
+
+def test_damaged_geotiffs_are_refused_or_read_but_never_crash(tmp_path, pile, capfd):
+    write_tif(tmp_path / "pile.tif", np.asarray(pile.height)[20:80, 20:80], compress="deflate")
+    check_damage(tmp_path / "pile.tif", capfd)
+
+
+# --- point clouds
+
+
+def write_las(path, points):
+    laspy = pytest.importorskip("laspy")
+    if path.suffix == ".laz":
+        pytest.importorskip("lazrs")
+    cloud = laspy.create()
+    cloud.header.scales = [0.001] * 3
+    cloud.x, cloud.y, cloud.z = points.T
+    cloud.write(path)
+    return path
+
+
+def write_ply(path, points, encoding="binary_little_endian", extra=""):
+    order = ">" if encoding.endswith("big_endian") else "<"
+    head = (
+        f"ply\nformat {encoding} 1.0\ncomment a scan\nelement vertex {len(points)}\n"
+        f"property double x\nproperty float y\nproperty double z\n{extra}end_header\n"
+    )
+    rows = [(x, y, z) for x, y, z in points]
+    if encoding == "ascii":
+        body = "\n".join(" ".join(f"{value:.4f}" for value in row) for row in rows).encode()
+    else:
+        body = b"".join(struct.pack(order + "dfd", *row) for row in rows)
+    path.write_bytes(head.encode() + body)
+    return path
+
+
+@pytest.mark.parametrize("ending", [".las", ".laz", ".ply"])
+def test_point_clouds_are_gridded(tmp_path, pile, ending):
+    points = points_of(pile, np.random.default_rng(0))
+    write = write_ply if ending == ".ply" else write_las
+    again = io.read_pile(write(tmp_path / f"pile{ending}", points))
+    assert again.height.shape == pile.height.shape
+    np.testing.assert_allclose(again.origin, pile.origin, atol=2e-3)
+    valid = np.ones(pile.height.shape, bool) if again.valid is None else np.asarray(again.valid)
+    assert valid.mean() > 0.99
+    error = np.abs(np.asarray(again.height - pile.height))
+    assert np.median(error) < 1e-3
+    assert np.quantile(error, 0.99) < 0.1  # cells filled from their neighbours
+    assert volume(again) == pytest.approx(float(volume(pile)), rel=0.01)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_ply_encodings_read_alike(tmp_path, pile, encoding):
+    points = points_of(pile, np.random.default_rng(0), 20_000)
+    want = io.read_pile(write_ply(tmp_path / "a.ply", points))
+    again = io.read_pile(write_ply(tmp_path / "b.ply", points, encoding))
+    np.testing.assert_allclose(again.height, want.height, atol=2e-3)
+
+
+def test_cells_without_points_are_unseen_and_filled(tmp_path, pile):
+    points = points_of(pile, np.random.default_rng(0), 200_000)
+    hole = np.hypot(points[:, 0] - 1.0, points[:, 1]) < 0.8
+    again = io.read_pile(write_ply(tmp_path / "pile.ply", points[~hole]))
+    assert np.sum(~np.asarray(again.valid)) * 0.01 == pytest.approx(math.pi * 0.8**2, rel=0.2)
+    assert np.isfinite(again.height).all()
+
+
+def test_the_median_of_a_cell_ignores_a_bird(tmp_path, pile):
+    points = points_of(pile, np.random.default_rng(0), 100_000)
+    points[7, 2] += 30.0
+    again = io.read_pile(write_ply(tmp_path / "pile.ply", points))
+    assert float(again.height.max()) < 3.0
+
+
+def test_a_sparse_cloud_is_gridded_by_its_spacing(tmp_path, pile):
+    points = points_of(pile, np.random.default_rng(0), 1500)
+    again = io.read_pile(write_ply(tmp_path / "pile.ply", points))
+    assert again.cell_size == 0.1
+    assert np.mean(np.ones(1) if again.valid is None else np.asarray(again.valid)) > 0.7
+    assert volume(again) == pytest.approx(float(volume(pile)), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        (b"property double z\n", b"property double q\n", "no x, y and z"),
+        (b"element vertex", b"element face", "vertices"),
+        (b"binary_little_endian", b"binary_middle_endian", "unknown format"),
+        (b"property float y", b"property list uchar int y", "vertices of type"),
+        (b"vertex 9000", b"vertex 9999999", "cut short"),
+        (b"vertex 9000", b"vertex many", "cannot be read"),
+        (b"vertex 9000", b"vertex 0", "three points"),
+    ],
+)
+def test_bad_ply_headers_are_refused(tmp_path, pile, old, new, match):
+    path = write_ply(tmp_path / "pile.ply", points_of(pile, np.random.default_rng(0), 9000))
+    path.write_bytes(path.read_bytes().replace(old, new, 1))
+    refused(path, match)
+
+
+def test_a_cloud_with_a_point_far_off_is_refused(tmp_path, pile):
+    points = points_of(pile, np.random.default_rng(0), 9000)
+    points[0, 0] = 5000.0
+    refused(write_ply(tmp_path / "pile.ply", points), "crop it")
+
+
+@pytest.mark.parametrize("ending", [".las", ".laz", ".ply"])
+def test_damaged_point_clouds_are_refused_or_read_but_never_crash(tmp_path, pile, ending, capfd):
+    points = points_of(pile, np.random.default_rng(0), 3000)
+    write = write_ply if ending == ".ply" else write_las
+    check_damage(write(tmp_path / f"pile{ending}", points), capfd)
+
+
+@pytest.mark.parametrize(("ending", "module"), [(".tif", "rasterio"), (".laz", "laspy")])
+def test_a_missing_reader_says_what_to_install(tmp_path, monkeypatch, ending, module):
+    def without_it(name, *rest):
+        if name == module:
+            raise ModuleNotFoundError(name)
+        return real(name, *rest)
+
+    real = io.importlib.import_module
+    monkeypatch.setattr(io.importlib, "import_module", without_it)
+    path = tmp_path / f"pile{ending}"
+    path.write_bytes(b"x")
+    refused(path, r"pip install wlplan\[scan\]")
+
+
+# --- plans
+
+
+@pytest.fixture
+def plan():
+    pose = Pose(*(jnp.asarray(values) for values in ([0.0, 1.0], [2.0, 3.0], [0.5, -0.5])))
+    action = Action(*(jnp.asarray(v) for v in ([0.7, 0.1], [5.0, 4.5], [0.0, 0.2], [2.5, 0.0])))
+    return LoadingPlan(pose=pose, action=action)
+
+
+@pytest.fixture
+def document(plan):
+    performance = Performance(*(jnp.asarray([a, a + 1.0]) for a in (3.0, 11.0, 400.0)))
+    transport = {"time": jnp.asarray([5.0, 6.0]), "work": np.zeros(2)}
+    return io.plan_to_dict(
+        plan, predicted=performance, transport=transport, world="low", seed=np.int64(3)
+    )
+
+
+def test_a_plan_reads_back_the_same(tmp_path, plan, document):
+    io.write_plan(tmp_path / "plan.json", document)
+    again, data = io.read_plan(tmp_path / "plan.json")
+    for part in ("pose", "action"):
+        for name, values in vars(getattr(plan, part)).items():
+            np.testing.assert_array_equal(getattr(getattr(again, part), name), values)
+    assert data["format"] == "wlplan.plan/1"
+    assert data["seed"] == 3
+    load = data["loads"][1]
+    assert load["predicted"] == {"mass": 4.0, "time": 12.0, "work": 401.0}
+    assert load["transport"] == {"time": 6.0, "work": 0.0}
+    assert "simulated" not in load
+
+
+def refused_plan(path, match):
+    with pytest.raises(InputError, match=match) as error:
+        io.read_plan(path)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+
+
+def in_load(name, value):
+    return lambda data: data["loads"][1].update({name: value})
+
+
+def in_action(name, value):
+    return lambda data: data["loads"][1]["action"].update({name: value})
+
+
+BAD_PLANS = [
+    (setting("format", "wlplan.plan/2"), "has format"),
+    (without("format"), "has format"),
+    (without("loads"), "no loads"),
+    (setting("loads", []), "no loads"),
+    (setting("loads", {}), "no loads"),
+    (setting("loads", [3]), "load 1: `x` is missing"),
+    (lambda data: data["loads"][1].pop("heading"), "load 2: `heading` is missing"),
+    (lambda data: data["loads"][1].pop("action"), "load 2: `action` is missing"),
+    (lambda data: data["loads"][1]["action"].pop("k_bm"), "load 2, action: `k_bm` is missing"),
+    (in_load("action", 7), "load 2, action: `delta_bm` is missing"),
+    (in_load("x", "east"), "load 2: `x` is 'east', not a finite number"),
+    (in_load("x", None), "not a finite number"),
+    (in_load("x", True), "not a finite number"),
+    (in_load("x", 10**400), "not a finite number"),
+    (in_load("x", math.nan), "holds NaN"),
+    (in_load("predicted", {"mass": math.inf}), "holds Infinity"),
+    (in_action("delta_bm", 0.8), "load 2: delta_bm is 0.8, outside its range 0 to 0.7"),
+    (in_action("k_bk", -0.1), "load 2: k_bk is -0.1, outside its range 0 to 5"),
+]
+
+
+@pytest.mark.parametrize(("change", "match"), BAD_PLANS)
+def test_bad_plans_are_neither_read_nor_written(tmp_path, document, change, match):
+    path = tmp_path / "plan.json"
+    change(document)
+    path.write_text(json.dumps(document))
+    refused_plan(path, match)
+    path.unlink()
+    with pytest.raises(InputError, match=match):
+        io.write_plan(path, document)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[]", "3", "null", "[" * 100_000, "\x00", '{"format": "wlplan.plan/1"', "1e999"],
+)
+def test_files_that_are_no_plans_are_refused(tmp_path, text):
+    (tmp_path / "plan.json").write_text(text)
+    refused_plan(tmp_path / "plan.json", "")
+
+
+def test_plans_that_are_no_text_or_no_file_are_refused(tmp_path):
+    (tmp_path / "plan.json").write_bytes(b"\xff\xfe\x00")
+    refused_plan(tmp_path / "plan.json", "cannot be read")
+    refused_plan(tmp_path / "none.json", "no such plan file")
+    refused_plan(tmp_path, "is a folder")
+
+
+def test_actions_that_went_through_float32_are_put_back_into_the_box(tmp_path, document):
+    document["loads"][0]["action"].update(delta_bm=0.7 + 1e-8, k_bm=-1e-8)
+    io.write_plan(tmp_path / "plan.json", document)
+    plan, _ = io.read_plan(tmp_path / "plan.json")
+    assert plan.action.k_bm[0] == 0.0
+
+
+# --- writing in one piece
+
+
+def test_files_are_replaced_in_one_piece(tmp_path):
+    path = tmp_path / "note.txt"
+    io.write_text_atomic(path, "ä")
+    io.write_text_atomic(path, "ö")
+    assert path.read_text(encoding="utf-8") == "ö"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["note.txt"]
+
+
+@pytest.mark.parametrize("failure", [OSError("disk full"), KeyboardInterrupt()])
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, failure):
+    path = tmp_path / "note.txt"
+    path.write_text("old")
+
+    def fail(*_):
+        raise failure
+
+    monkeypatch.setattr(os, "replace", fail)
+    expected = InputError if isinstance(failure, OSError) else KeyboardInterrupt
+    with pytest.raises(expected):
+        io.write_text_atomic(path, "new")
+    assert path.read_text() == "old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["note.txt"]
+
+
+def test_places_that_cannot_be_written_are_refused(tmp_path, pile):
+    for path in (tmp_path / "none" / "pile.npz", tmp_path / ("n" * 300 + ".npz")):
+        with pytest.raises(InputError, match="cannot be written") as error:
+            io.write_pile(path, pile)
+        assert "\n" not in str(error.value)
+    with pytest.raises(InputError, match=r"\.npz"):
+        io.write_pile(tmp_path / "pile.tif", pile)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match="cannot be written"):
+        io.write_text_atomic(tmp_path / "folder", "text")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]

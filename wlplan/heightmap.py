@@ -1,0 +1,158 @@
+"""Local heightmaps: the pile as seen from a dig pose, sampled and written back.
+
+Sampling is bilinear, so it is differentiable in the pose (with a kink where a sample crosses the
+line between two cell centres). Outside the grid the border value is repeated.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from wlplan.types import LocalHeightmap, Pile, Pose
+from wlplan.units import CELL_SIZE
+
+# Paper, section 5.3: 3.6 m for the performance predictor, which leaves 0.5 m on either side of the
+# bucket; 5.2 m displaced by 1.0 m towards the approach for the pile state predictor.
+PERFORMANCE_CELLS, PERFORMANCE_DISPLACEMENT = 36, 0.0
+STATE_CELLS, STATE_DISPLACEMENT = 52, 1.0
+
+
+def local_axes(cells: int, displacement: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions of the rows along e_x and of the columns along e_y of a local heightmap [m]."""
+    return (
+        np.arange(cells) * CELL_SIZE - displacement,
+        (np.arange(cells) - (cells - 1) / 2) * CELL_SIZE,
+    )
+
+
+def sample(
+    field: Float[Array, "nx ny"], pile: Pile, x: Float[Array, "*n"], y: Float[Array, "*n"]
+) -> Float[Array, "*n"]:
+    """Bilinear interpolation of a field on the pile's grid at world positions [m]."""
+    nx, ny = field.shape
+    u = jnp.clip((x - pile.origin[0]) / pile.cell_size, 0.0, nx - 1.0)
+    v = jnp.clip((y - pile.origin[1]) / pile.cell_size, 0.0, ny - 1.0)
+    i = jnp.clip(jnp.floor(u), 0, nx - 2).astype(jnp.int32)
+    j = jnp.clip(jnp.floor(v), 0, ny - 2).astype(jnp.int32)
+    a, b = u - i, v - j
+    flat = field.reshape(-1)
+    corner = i * ny + j
+    h00, h01, h10, h11 = (flat[corner + step] for step in (0, 1, ny, ny + 1))
+    return (1 - a) * ((1 - b) * h00 + b * h01) + a * ((1 - b) * h10 + b * h11)
+
+
+def to_world(
+    pose: Pose, along: Float[Array, "*n"], left: Float[Array, "*n"]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """World position of points given in the local frame of a pose [m]."""
+    c, s = jnp.cos(pose.heading), jnp.sin(pose.heading)
+    return pose.x + c * along - s * left, pose.y + s * along + c * left
+
+
+def to_local(
+    pose: Pose, x: Float[Array, "*n"], y: Float[Array, "*n"]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Position along e_x and e_y of points given in the world frame [m]."""
+    c, s = jnp.cos(pose.heading), jnp.sin(pose.heading)
+    dx, dy = x - pose.x, y - pose.y
+    return c * dx + s * dy, c * dy - s * dx
+
+
+def cell_centres(pile: Pile) -> tuple[Float[Array, "nx ny"], Float[Array, "nx ny"]]:
+    """World positions x and y of the cells of a pile [m]."""
+    nx, ny = pile.height.shape
+    dtype = pile.height.dtype
+    x = pile.origin[0] + pile.cell_size * jnp.arange(nx, dtype=dtype)
+    y = pile.origin[1] + pile.cell_size * jnp.arange(ny, dtype=dtype)
+    return jnp.broadcast_to(x[:, None], (nx, ny)), jnp.broadcast_to(y[None, :], (nx, ny))
+
+
+def sample_local(
+    pile: Pile,
+    pose: Pose,
+    *,
+    cells: int = PERFORMANCE_CELLS,
+    displacement: float = PERFORMANCE_DISPLACEMENT,
+) -> LocalHeightmap:
+    """The local heightmap of the paper's section 3.2 at one dig pose.
+
+    Args:
+        pile: The pile; its own spacing may differ from the 0.1 m of the map.
+        pose: Dig location and heading.
+        cells: Cells a side: 36 for the performance predictor, 52 for the pile state predictor.
+        displacement: How far the map begins before the dig location [m].
+    """
+    along, left = (jnp.asarray(a, pile.height.dtype) for a in local_axes(cells, displacement))
+    along, left = jnp.meshgrid(along, left, indexing="ij")
+    height = sample(pile.height, pile, *to_world(pose, along, left))
+    first = sample(pile.height, pile, *to_world(pose, jnp.asarray(-displacement), jnp.asarray(0.0)))
+    return LocalHeightmap(height - first, CELL_SIZE, displacement)
+
+
+def add_local_change(
+    height: Float[Array, "nx ny"],
+    window: Pile,
+    pose: Pose,
+    change: Float[Array, "n n"],
+    displacement: float,
+) -> Float[Array, "nx ny"]:
+    """Writes a change of the local heightmap back to the grid, mass exact.
+
+    The change is interpolated at the cells of the grid. Losses and gains are scaled, each by a
+    factor close to one, so that both move exactly the volume that they move in the local frame;
+    no cell is dug below the floor.
+
+    Args:
+        height: Surface to change [m].
+        window: Pile on the same grid, for geometry and floor.
+        pose: Pose of the local frame.
+        change: Change of the local heightmap [m].
+        displacement: How far the local map begins before the dig location [m].
+    """
+    n = change.shape[0]
+    along, left = to_local(pose, *cell_centres(window))
+    # A border of zeros lets the change fade to nothing outside the local map.
+    padded = jnp.pad(change, 1)
+    start = (-displacement - CELL_SIZE, -(n + 1) / 2 * CELL_SIZE)
+    frame = Pile(padded, CELL_SIZE, jnp.asarray(start, change.dtype))
+    inside = (jnp.abs(left) < (n + 1) / 2 * CELL_SIZE) & (
+        jnp.abs(along - (n - 1) / 2 * CELL_SIZE + displacement) < (n + 1) / 2 * CELL_SIZE
+    )
+    on_grid = jnp.where(inside, sample(padded, frame, along, left), 0.0)
+    floor = jnp.zeros_like(height) if window.ground is None else window.ground
+    available = jnp.maximum(height - floor, 0.0)
+    area_ratio = (CELL_SIZE / window.cell_size) ** 2
+    lost = area_ratio * jnp.maximum(-change, 0.0).sum()
+    gained = area_ratio * jnp.maximum(change, 0.0).sum()
+    loss = take(jnp.maximum(-on_grid, 0.0), available, lost)
+    gain = jnp.maximum(on_grid, 0.0)
+    total = gain.sum()
+    scale = jnp.where(total > 0.0, gained / jnp.where(total > 0.0, total, 1.0), 0.0)
+    return height - loss + scale * gain
+
+
+def take(
+    wanted: Float[Array, "nx ny"], available: Float[Array, "nx ny"], total: Float[Array, ""]
+) -> Float[Array, "nx ny"]:
+    """Scales what is wanted of each cell so that `total` is taken in all, as far as it is there.
+
+    The scale s solves sum(min(s * wanted, available)) = total, by Newton's method on a concave
+    piecewise linear function; the last, differentiable step carries the implicit gradient.
+    """
+
+    def newton(scale: Array, wanted: Array, available: Array, total: Array) -> Array:
+        amount = jnp.minimum(scale * wanted, available).sum()
+        slope = lax.stop_gradient(jnp.where(scale * wanted < available, wanted, 0.0).sum())
+        step = jnp.where(slope > 0.0, (total - amount) / jnp.where(slope > 0.0, slope, 1.0), 0.0)
+        return jnp.clip(scale + step, 0.0, _LARGEST_SCALE)
+
+    frozen = lax.stop_gradient((wanted, available, total))
+    scale = lax.fori_loop(0, 4, lambda _, s: newton(s, *frozen), jnp.ones_like(frozen[2]))
+    return jnp.minimum(newton(scale, wanted, available, total) * wanted, available)
+
+
+# Where nothing is left to take, the scale would grow without bound.
+_LARGEST_SCALE = 1e3

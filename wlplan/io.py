@@ -1,0 +1,597 @@
+"""Scans and plans on disk. Whatever is wrong with a file comes back as one `InputError` line.
+
+The world frame of a scan is its own, x east, y north, z up, in metres. Coordinates of a survey are
+too large for float32, so whole kilometres are taken off x and y when the map lies more than 10 km
+from zero, and whole hundreds of metres off z when its lowest point is more than 100 m from zero:
+the last digits of the survey's coordinates stay as they are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import io
+import json
+import logging
+import math
+import os
+import secrets
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from importlib import resources
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy import ndimage
+
+from wlplan.errors import InputError
+from wlplan.ground import estimate_ground, fill_unseen
+from wlplan.pile import ground_height, resample
+from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
+from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE
+
+PLAN_FORMAT = "wlplan.plan/1"
+
+# Shortest side of a map that a bucket with its surroundings fits into [m], a little more than the
+# 3.6 m window of the models, and most cells a side that are taken.
+_SHORTEST_SIDE = 4.0
+_MOST_CELLS = 4000
+# Coordinates above which whole kilometres, and heights above which whole hundreds of metres, are
+# taken off [m]: float32 resolves 1 mm at the one and 0.01 mm at the other.
+_FAR = 10_000.0
+_HIGH = 100.0
+# A point cloud is gridded at this many times its mean spacing where that is more than a cell: two
+# points a cell leave few cells empty.
+_SPACINGS = 1.5
+# Slack on the box of the actions, for numbers that went through float32.
+_ROUNDING = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class _Scan:
+    """A map as a file holds it, not yet checked."""
+
+    height: np.ndarray  # [m]
+    cell_size: float  # [m]
+    origin: np.ndarray  # [m]
+    valid: np.ndarray | None = None
+    ground: np.ndarray | None = None  # [m]
+
+
+def bundled_pile_path() -> Path:
+    """Path of the pile that ships with the package, a published heightmap of a built soil mound."""
+    return Path(str(resources.files("wlplan").joinpath("data", "marsyard2022_mound.npz")))
+
+
+def read_pile(
+    path: str | os.PathLike[str],
+    *,
+    ground: Float[Array | np.ndarray, "nx ny"] | float | None = None,
+) -> Pile:
+    """Read a pile and resample it to the grid spacing of the models, 0.1 m.
+
+    Formats, by extension:
+
+    * `.npz`: `height` [nx, ny] [m], `cell_size` [m], optional `origin` [2] [m] (centre of cell
+      [0, 0]), `valid` bool [nx, ny] and `ground` [nx, ny] [m]. Axis 0 is x, axis 1 is y.
+    * `.tif`, `.tiff`: GeoTIFF, band 1, square cells along the axes, metres. Nodata and NaN are
+      unseen. A file without georeference is refused, since nothing tells its cell size.
+    * `.las`, `.laz`, `.ply`: point clouds, x, y, z in metres, z up. The height of a cell is the
+      median of its points; cells without points are unseen, but for single ones amid seen cells.
+
+    Unseen cells are filled smoothly from seen ones; a fill that the file brings is kept where it
+    lies within the range of the seen heights. Coordinates far from zero: see the module.
+
+    Args:
+        path: File to read.
+        ground: Floor under the pile [m] in the file's frame: a level, or a map on the grid of the
+            file. By default that of the file, else `wlplan.ground.estimate_ground` finds it around
+            the toe. It is lowered to the surface wherever it lies above.
+
+    Returns:
+        The pile on the 0.1 m grid, with its ground.
+
+    Raises:
+        InputError: If the file cannot be used; one line that says why and what to do.
+    """
+    path = Path(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(
+            f"{path}: unknown kind of pile file {path.suffix!r}: use one of {', '.join(_READERS)}."
+        )
+    _check_is_file(path, "pile")
+    with _named(path):
+        try:
+            with warnings.catch_warnings(), _silent("rasterio", "laspy"):
+                warnings.simplefilter("ignore")
+                scan = reader(path)
+        except InputError:
+            raise
+        except Exception as error:
+            # Damaged bytes make third-party readers raise almost anything, from zlib.error to
+            # MemoryError; to the user they all mean the same.
+            raise InputError(
+                f"cannot be read as {path.suffix.lower()} ({_one_line(error)}): the file is "
+                f"damaged or cut short; copy or export it again."
+            ) from error
+        return _to_pile(scan, ground)
+
+
+def _to_pile(scan: _Scan, ground: Array | np.ndarray | float | None) -> Pile:
+    """Check a scan, fill its gaps, resample it and find its ground."""
+    height, origin = _real("height", scan.height), _real("origin", scan.origin)
+    if height.ndim != 2:
+        raise InputError(f"`height` has shape {height.shape}: it has to be 2-D, x by y.")
+    shape = height.shape
+    _check_size(shape, scan.cell_size)
+    if origin.shape != (2,) or not np.isfinite(origin).all():
+        raise InputError("`origin` has to be two finite numbers, x and y of the first cell.")
+    valid = _valid(scan.valid, shape)
+    bad = int(np.sum(valid & ~np.isfinite(height)))
+    if bad:
+        raise InputError(
+            f"`height` is NaN or infinite in {bad} cells that count as seen: mark them as unseen "
+            f"(False in `valid`, or nodata)."
+        )
+    if not valid.any():
+        raise InputError("no cell counts as seen: check the mask or the nodata value.")
+    low, high = float(height[valid].min()), float(height[valid].max())
+    with np.errstate(invalid="ignore"):
+        known = valid | ((height >= low) & (height <= high))
+    height = fill_unseen(height, known)
+
+    floor = scan.ground if ground is None else ground
+    if isinstance(floor, float | int):
+        floor = np.full(shape, float(floor))
+    if floor is not None:
+        floor = _real("ground", floor)
+        if floor.shape != shape:
+            raise InputError(f"`ground` has shape {floor.shape}, but `height` {shape}.")
+        if not np.isfinite(floor[valid]).all():
+            raise InputError("`ground` is NaN or infinite in cells that count as seen.")
+        floor = np.minimum(fill_unseen(floor, np.isfinite(floor)), height)
+
+    centre = origin + 0.5 * scan.cell_size * np.array(shape)
+    origin = origin - np.where(np.abs(centre) > _FAR, 1000.0 * np.floor(centre / 1000.0), 0.0)
+    sea_level = 100.0 * math.floor(low / 100.0) if abs(low) > _HIGH else 0.0
+    pile = resample(
+        Pile(
+            height=_floats(height - sea_level),
+            cell_size=scan.cell_size,
+            origin=_floats(origin),
+            ground=None if floor is None else _floats(floor - sea_level),
+            valid=None if valid.all() else jnp.asarray(valid),
+        ),
+        CELL_SIZE,
+    )
+    if floor is None:
+        found = _floats(estimate_ground(pile.height, CELL_SIZE, pile.valid))
+        pile = pile.replace(ground=jnp.minimum(found, pile.height))  # type: ignore[attr-defined]
+    return pile.replace(cell_size=CELL_SIZE)  # type: ignore[attr-defined]
+
+
+def _check_size(shape: tuple[int, ...], cell_size: float) -> None:
+    """Refuse maps that no bucket fits into and maps that no memory holds."""
+    if not 0.0 < cell_size < math.inf:
+        raise InputError(f"the cell size is {cell_size:g} m: it has to be positive.")
+    sides = [n * cell_size for n in shape]
+    text = f"the map is {sides[0]:.4g} x {sides[1]:.4g} m"
+    if min(sides) < _SHORTEST_SIDE or min(shape) < 2:
+        raise InputError(
+            f"{text}, too small for a bucket: a side needs at least {_SHORTEST_SIDE:g} m; check "
+            f"the cell size and the units."
+        )
+    if max(*shape, *(side / CELL_SIZE for side in sides)) > _MOST_CELLS + 0.5:
+        raise InputError(
+            f"{text} in {shape[0]} x {shape[1]} cells: a side may have {_MOST_CELLS} cells, before "
+            f"and after resampling to {CELL_SIZE:g} m; crop it to the pile, or check the units."
+        )
+
+
+def _valid(valid: np.ndarray | None, shape: tuple[int, ...]) -> Bool[np.ndarray, "nx ny"]:
+    if valid is None:
+        return np.ones(shape, bool)
+    if valid.shape != shape:
+        raise InputError(f"`valid` has shape {valid.shape}, but `height` {shape}.")
+    if valid.dtype != bool and not (valid.dtype.kind in "iuf" and np.isin(valid, (0, 1)).all()):
+        raise InputError("`valid` holds values other than True and False: store it as bool.")
+    return valid.astype(bool)
+
+
+def _real(name: str, values: Any) -> np.ndarray:
+    values = np.asarray(values)
+    if values.dtype.kind not in "iuf":
+        raise InputError(f"`{name}` holds {values.dtype} values: store real numbers.")
+    return values.astype(np.float64)
+
+
+def _floats(values: np.ndarray) -> Array:
+    """float32, or float64 under `jax_enable_x64`."""
+    return jnp.asarray(values.astype(jnp.zeros(()).dtype))
+
+
+def _read_npz(path: Path) -> _Scan:
+    with np.load(path, allow_pickle=False) as archive:
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise InputError("holds a single array: save it by np.savez with height and cell_size.")
+        # Every field is read here, so that damage shows up here.
+        fields = {name: archive[name] for name in archive.files}
+    for name in ("height", "cell_size"):
+        if name not in fields:
+            raise InputError(
+                f"has no field `{name}`, only {sorted(fields)}: save `height` [nx, ny] in metres "
+                f"and `cell_size` in metres."
+            )
+    cell_size = _real("cell_size", fields["cell_size"])
+    if cell_size.size != 1:
+        raise InputError(f"`cell_size` has shape {cell_size.shape}: it has to be one number.")
+    return _Scan(
+        height=fields["height"],
+        cell_size=float(cell_size.reshape(())),
+        origin=fields.get("origin", np.zeros(2)),
+        valid=fields.get("valid"),
+        ground=fields.get("ground"),
+    )
+
+
+def _read_geotiff(path: Path) -> _Scan:
+    rasterio = _optional("rasterio")
+    with rasterio.open(path) as file:
+        step = file.transform
+        if step.is_identity:
+            raise InputError(
+                "has no georeference, so its cell size is unknown: add a world file beside it, or "
+                "save it as .npz with a `cell_size`."
+            )
+        if file.crs is not None and (
+            file.crs.is_geographic or file.crs.linear_units_factor[1] != 1
+        ):
+            raise InputError("is not in metres: reproject it to a metric system such as UTM.")
+        cell = abs(step.a)
+        turned = max(abs(step.b), abs(step.d)) > 1e-6 * cell
+        if turned or not math.isclose(cell, abs(step.e), rel_tol=1e-3):
+            raise InputError("has rotated or oblong cells: resample it to square cells, north up.")
+        _check_size((file.width, file.height), cell)
+        band, mask = file.read(1), file.read_masks(1) > 0
+    # Rows run from north to south and columns from west to east, unless a step says otherwise.
+    height, valid = band.T, mask.T
+    west, south = step.c, step.f
+    if step.a < 0.0:
+        height, valid, west = height[::-1], valid[::-1], west + step.a * len(height)
+    if step.e < 0.0:
+        height, valid, south = height[:, ::-1], valid[:, ::-1], south + step.e * height.shape[1]
+    # A georeference names the corner of a cell, a pile its centre.
+    origin = np.array([west, south]) + 0.5 * cell
+    return _Scan(height, cell, origin, valid & ~np.isnan(height))
+
+
+def _read_las(path: Path) -> _Scan:
+    laspy = _optional("laspy")
+    cloud = laspy.read(path)
+    return _grid(np.stack([np.asarray(cloud[axis], np.float64) for axis in "xyz"], axis=-1))
+
+
+# The number types of a PLY header, as numpy's.
+_PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+
+
+def _read_ply(path: Path) -> _Scan:
+    """Read the vertices of an ascii or binary PLY file; they have to come first, as they do."""
+    head, end, body = path.read_bytes().partition(b"end_header")
+    # The header ends with its line, whose break may be one or two bytes.
+    _, _, body = body.partition(b"\n")
+    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    if not end or not lines or lines[0] != ["ply"]:
+        raise InputError("has no PLY header: export it again as PLY, LAS or .npz.")
+    encoding = next((line[1] for line in lines if line[:1] == ["format"]), "")
+    first = next((k for k, line in enumerate(lines) if line[:1] == ["element"]), len(lines))
+    if lines[first : first + 1] == [] or lines[first][1] != "vertex":
+        raise InputError("does not begin with its vertices: export it as a plain point cloud.")
+    count, fields = int(lines[first][2]), []
+    for line in lines[first + 1 :]:
+        if line[:1] == ["element"]:
+            break
+        if line[:1] == ["property"]:
+            if line[1] not in _PLY_TYPES:
+                raise InputError(
+                    f"has vertices of type {line[1]!r}: export plain x, y, z vertices."
+                )
+            fields.append((line[2], _PLY_TYPES[line[1]]))
+    if not {"x", "y", "z"} <= {name for name, _ in fields}:
+        raise InputError("has no x, y and z: export it with point coordinates.")
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(encoding)
+    if order is not None:
+        record = np.dtype([(name, order + kind) for name, kind in fields])
+        points = np.frombuffer(body[: count * record.itemsize], record)
+        columns = [points[axis].astype(np.float64) for axis in "xyz"]
+    elif encoding == "ascii":
+        words = np.array(body.split(None, count * len(fields))[: count * len(fields)], dtype=float)
+        table = words.reshape(-1, len(fields))
+        names = [name for name, _ in fields]
+        columns = [table[:, names.index(axis)] for axis in "xyz"]
+    else:
+        raise InputError(f"is PLY of unknown format {encoding!r}: export it as ascii or binary.")
+    if len(columns[0]) != count:
+        raise InputError(f"is cut short: {len(columns[0])} of {count} points; copy it again.")
+    return _grid(np.stack(columns, axis=-1))
+
+
+def _grid(points: Float[np.ndarray, "n 3"]) -> _Scan:
+    """Put a point cloud on a grid: the median height of each cell that has points."""
+    points = points[np.isfinite(points).all(axis=-1)]
+    if len(points) < 3:
+        raise InputError("has fewer than three points: export the point cloud again.")
+    low = points.min(axis=0)[:2]
+    extent = np.maximum(points.max(axis=0)[:2] - low, 1e-3)
+    cell = max(CELL_SIZE, _SPACINGS * math.sqrt(float(np.prod(extent)) / len(points)))
+    # Points on a regular grid land amid the cells, not on their borders.
+    shape = tuple(int(n) for n in np.rint(extent / cell) + 1)
+    _check_size(shape, cell)
+    index = np.ravel_multi_index(tuple(np.rint((points[:, :2] - low) / cell).astype(int).T), shape)
+    order = np.lexsort((points[:, 2], index))
+    cells, start, count = np.unique(index[order], return_index=True, return_counts=True)
+    height = np.full(shape, np.nan)
+    height.flat[cells] = points[order, 2][start + (count - 1) // 2]
+    seen = np.isfinite(height)
+    padded = ndimage.binary_closing(np.pad(seen, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
+    height = fill_unseen(height, seen)
+    return _Scan(height, cell, low, seen | padded)
+
+
+_READERS: dict[str, Callable[[Path], _Scan]] = {
+    ".npz": _read_npz,
+    ".tif": _read_geotiff,
+    ".tiff": _read_geotiff,
+    ".las": _read_las,
+    ".laz": _read_las,
+    ".ply": _read_ply,
+}
+
+
+def write_pile(path: str | os.PathLike[str], pile: Pile) -> None:
+    """Write one pile as .npz, in the format of `read_pile`, in one piece or not at all.
+
+    The ground is always written, so that reading does not estimate it anew.
+
+    Raises:
+        InputError: If the name does not end in .npz or the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".npz":
+        raise InputError(f"{path}: piles are written as .npz: choose a name with that ending.")
+    fields: dict[str, Any] = {
+        "height": np.asarray(pile.height),
+        "cell_size": np.float64(pile.cell_size),
+        "origin": np.asarray(pile.origin),
+        "ground": np.asarray(ground_height(pile)),
+    }
+    if pile.valid is not None:
+        fields["valid"] = np.asarray(pile.valid)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **fields)
+    write_bytes_atomic(path, buffer.getvalue())
+
+
+def plan_to_dict(
+    plan: LoadingPlan,
+    *,
+    predicted: Performance | None = None,
+    simulated: Performance | None = None,
+    transport: Mapping[str, Any] | None = None,
+    **rest: Any,
+) -> dict[str, Any]:
+    """Lay a plan out as the content of a plan.json.
+
+    Args:
+        plan: The loadings, leaves [N].
+        predicted: Performance by the world that planned, leaves [N], tonne, s, kJ.
+        simulated: Performance in the simulator, likewise.
+        transport: Arrays [N] by name, "time" [s] and "work" [kJ], of driving to the truck and back.
+        **rest: Further top-level fields: pile, world, objective, seed, total, ledger.
+    """
+    pose, action = _columns(plan.pose), _columns(plan.action)
+    extra = {
+        "predicted": predicted and _columns(predicted),
+        "transport": transport and {name: np.asarray(v).tolist() for name, v in transport.items()},
+        "simulated": simulated and _columns(simulated),
+    }
+    loads = []
+    for n in range(len(pose["x"])):
+        load: dict[str, Any] = {name: values[n] for name, values in pose.items()}
+        load["action"] = {name: values[n] for name, values in action.items()}
+        for part, columns in extra.items():
+            if columns:
+                load[part] = {name: values[n] for name, values in columns.items()}
+        loads.append(load)
+    return {"format": PLAN_FORMAT, **rest, "loads": loads}
+
+
+def _columns(record: Any) -> dict[str, list[float]]:
+    return {
+        field.name: np.asarray(getattr(record, field.name), np.float64).tolist()
+        for field in dataclasses.fields(record)
+    }
+
+
+def write_plan(path: str | os.PathLike[str], document: Mapping[str, Any]) -> None:
+    """Write the content of a plan.json, in one piece or not at all.
+
+    Args:
+        path: File to write.
+        document: Content as of `plan_to_dict`; numpy and JAX numbers are taken too.
+
+    Raises:
+        InputError: If `read_plan` would refuse it, or the file cannot be written.
+    """
+    with _named(Path(path)):
+        text = json.dumps(
+            dict(document), indent=2, default=lambda value: np.asarray(value).tolist()
+        )
+        _parse_plan(text)
+    write_text_atomic(path, text + "\n")
+
+
+def read_plan(path: str | os.PathLike[str]) -> tuple[LoadingPlan, dict[str, Any]]:
+    """Read a plan.json.
+
+    Returns:
+        The plan, leaves [N], and the whole document.
+
+    Raises:
+        InputError: If it is not a plan that can be played; one line that says where and why.
+    """
+    path = Path(path)
+    _check_is_file(path, "plan")
+    with _named(path):
+        try:
+            text = path.read_bytes().decode()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"cannot be read ({_one_line(error)}): is it a plan.json?") from error
+        return _parse_plan(text)
+
+
+def _parse_plan(text: str) -> tuple[LoadingPlan, dict[str, Any]]:
+    try:
+        document = json.loads(text, parse_float=_finite, parse_constant=_finite)
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"is not valid JSON ({_one_line(error)}): write the plan again."
+        ) from error
+    found = document.get("format") if isinstance(document, dict) else None
+    if found != PLAN_FORMAT:
+        raise InputError(
+            f"has format {_one_line(repr(found))}, not {PLAN_FORMAT!r}: it is not a plan, or one "
+            f"for another version of wlplan."
+        )
+    loads = document.get("loads")
+    if not isinstance(loads, list) or not loads:
+        raise InputError("has no loads: `loads` has to be a list with at least one loading.")
+    pose_names = [field.name for field in dataclasses.fields(Pose)]
+    action_names = [field.name for field in dataclasses.fields(Action)]
+    poses, actions = [], []
+    for n, load in enumerate(loads, start=1):
+        poses.append([_number(load, name, f"load {n}") for name in pose_names])
+        action = _member(load, "action", f"load {n}")
+        actions.append([_number(action, name, f"load {n}, action") for name in action_names])
+        for name, value, low, high in zip(
+            action_names, actions[-1], ACTION_LOW, ACTION_HIGH, strict=True
+        ):
+            if not low - _ROUNDING <= value <= high + _ROUNDING:
+                raise InputError(
+                    f"load {n}: {name} is {value:g}, outside its range {low:g} to {high:g}."
+                )
+    actions_in_box = np.clip(np.array(actions), ACTION_LOW, ACTION_HIGH)
+    plan = LoadingPlan(
+        pose=Pose(*(_floats(column) for column in np.array(poses).T)),
+        action=Action(*(_floats(column) for column in actions_in_box.T)),
+    )
+    return plan, document
+
+
+def _member(record: Any, name: str, where: str) -> Any:
+    if not isinstance(record, dict) or name not in record:
+        raise InputError(f"{where}: `{name}` is missing.")
+    return record[name]
+
+
+def _number(record: Any, name: str, where: str) -> float:
+    value = _member(record, name, where)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e30:
+        raise InputError(f"{where}: `{name}` is {_one_line(repr(value))}, not a finite number.")
+    return float(value)
+
+
+def _finite(text: str) -> float:
+    """Refuse NaN, infinity and numbers too large, which Python's JSON reader lets through."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise InputError(f"holds {_one_line(text)}: every number of a plan has to be finite.")
+    return value
+
+
+def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text file as UTF-8, in one piece or not at all: see `write_bytes_atomic`."""
+    write_bytes_atomic(path, text.encode())
+
+
+def write_bytes_atomic(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write a file beside its target and move it there, so that no reader sees half of it.
+
+    Raises:
+        InputError: If the folder is missing or the file cannot be written there. The target is then
+            as it was.
+    """
+    path = Path(path)
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        try:
+            with beside.open("xb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(beside, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                beside.unlink()
+            raise
+    except OSError as error:
+        reason = error.strerror or _one_line(error)
+        raise InputError(f"{path}: cannot be written ({reason}): choose another place.") from error
+
+
+def _check_is_file(path: Path, what: str) -> None:
+    # Unlike Path.exists, these take names that no file can have for missing ones.
+    if os.path.isdir(path):
+        raise InputError(f"{path}: is a folder: name the {what} file itself.")
+    if not os.path.exists(path):
+        raise InputError(f"{path}: no such {what} file: check the name.")
+
+
+def _optional(name: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            f"needs {name}, which is not installed: run `pip install wlplan[scan]`."
+        ) from error
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Put the name of the file before the message of an `InputError`."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error.__cause__
+
+
+@contextlib.contextmanager
+def _silent(*names: str) -> Iterator[None]:
+    """Keep libraries from logging a second line about a file that we refuse in one."""
+    loggers = [logging.getLogger(name) for name in names]
+    before = [logger.disabled for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.disabled = True
+        yield
+    finally:
+        for logger, disabled in zip(loggers, before, strict=True):
+            logger.disabled = disabled
+
+
+def _one_line(error: object) -> str:
+    """The gist of a message: one line, at most 120 characters."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 120 else text[:117] + "..."

@@ -1,0 +1,84 @@
+"""The simulator as a World: a cycle on the local heightfield, written back, and left to slide."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+
+from wlplan.automaton import DEFAULT_SCHEDULE, Schedule, settle_window, window_of
+from wlplan.heightmap import (
+    STATE_CELLS,
+    STATE_DISPLACEMENT,
+    add_local_change,
+    local_axes,
+    sample,
+    to_world,
+)
+from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
+from wlplan.simulator.cycle import Cycle, Settings, dig
+from wlplan.types import Action, Performance, Pile, Pose
+from wlplan.units import J_PER_KJ, KG_PER_TONNE
+
+
+@no_type_check
+@struct.dataclass
+class Simulator:
+    """A World that plays the loading cycle; all fields are static."""
+
+    machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
+    soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
+    settings: Settings = struct.field(pytree_node=False, default=Settings())
+    schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
+
+    def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+        """The pile and the performance after one loading."""
+        after, performance, _ = self.play(pile, pose, action)
+        return after, performance
+
+    def play(
+        self, pile: Pile, pose: Pose, action: Action
+    ) -> tuple[Pile, Performance, Cycle]:
+        """One loading with its record.
+
+        The loader stands on the floor at the dig location, level; a floor that rises into the
+        pile limits the cut from below.
+
+        Args:
+            pile: Pile before.
+            pose: Dig location and heading.
+            action: Parameters of the bucket-filling controller.
+
+        Returns:
+            The pile after, relaxed; the performance, whose work includes the wheels' slip; and
+            the record of the cycle in SI units.
+        """
+        window, start = window_of(pile, pose)
+        axes = (jnp.asarray(a, pile.height.dtype) for a in local_axes(STATE_CELLS, STATE_DISPLACEMENT))
+        points = to_world(pose, *jnp.meshgrid(*axes, indexing="ij"))
+        floor = jnp.zeros_like(window.height) if window.ground is None else window.ground
+        level = sample(floor, window, pose.x, pose.y)
+        height = sample(window.height, window, *points) - level
+        ground = sample(floor, window, *points) - level
+        cycle = dig(
+            height,
+            ground,
+            action,
+            machine=self.machine,
+            soil=self.soil,
+            settings=self.settings,
+        )
+        # What left the grid is the load: float rounding of the time stepping goes to the mass.
+        change = cycle.height - height
+        dug = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+        settled = settle_window(
+            window.replace(height=dug), repose_angle=self.soil.repose_angle, schedule=self.schedule
+        )
+        after = pile.replace(height=lax.dynamic_update_slice(pile.height, settled, start))
+        work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
+        performance = Performance(
+            mass=cycle.mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ
+        )
+        return after, performance, cycle
