@@ -95,7 +95,7 @@ def test_a_map_without_a_pile_is_read(tmp_path, fields):
 
 
 def test_a_map_of_another_spacing_is_resampled(tmp_path, fields):
-    fields["cell_size"] = 0.25
+    fields.update(cell_size=0.25, height=2.5 * fields["height"])
     pile = io.read_pile(save(tmp_path / "pile.npz", fields))
     assert pile.cell_size == 0.1
     want = float(np.sum(fields["height"])) * 0.25**2
@@ -182,6 +182,10 @@ def nan_in(name):
         (setting("ground", np.zeros((5, 5))), "`ground` has shape"),
         (setting("ground", np.zeros(5)), "`ground` has shape"),
         (nan_in("ground"), "`ground` is NaN"),
+        (setting("ground", np.full((139, 139), -9999.0)), "`ground` is NaN or more than 200 m"),
+        (setting("height", np.eye(50) * 1e4), "no pile: check the units"),
+        (setting("height", np.full((50, 50), 1e300)), "no pile: check the units"),
+        (setting("origin", np.array([0.0, 1e30])), "`origin`"),
         (setting("origin", np.zeros(3)), "`origin`"),
         (setting("origin", np.array([0.0, np.nan])), "`origin`"),
         (setting("origin", np.array(["a", "b"])), "`origin`"),
@@ -228,7 +232,7 @@ def test_files_of_something_else_are_refused(tmp_path, content, ending, capfd):
         pytest.importorskip("rasterio")
     path = tmp_path / f"pile{ending}"
     path.write_bytes(content)
-    refused(path, "")
+    refused(path, "pile")
     assert capfd.readouterr() == ("", "")
 
 
@@ -248,16 +252,23 @@ def damaged(content, random):
         yield bytes(changed)
 
 
+def outcome(path):
+    """Return "read", or the message that a pile was refused with; anything else fails the test."""
+    try:
+        io.read_pile(path)
+    except InputError as error:
+        return str(error)
+    return "read"
+
+
 def check_damage(path, capfd):
-    content, refusals = path.read_bytes(), 0
+    content = path.read_bytes()
+    outcomes = []
     for broken in damaged(content, np.random.default_rng(0)):
         path.write_bytes(broken)
-        try:
-            io.read_pile(path)
-        except InputError as error:
-            assert "\n" not in str(error)
-            refusals += 1
-    assert refusals >= 4
+        outcomes.append(outcome(path))
+    assert all("\n" not in message for message in outcomes)
+    assert sum(message != "read" for message in outcomes) >= 4
     assert capfd.readouterr() == ("", "")
 
 
@@ -479,9 +490,7 @@ def plan():
 def document(plan):
     performance = Performance(*(jnp.asarray([a, a + 1.0]) for a in (3.0, 11.0, 400.0)))
     transport = {"time": jnp.asarray([5.0, 6.0]), "work": np.zeros(2)}
-    return io.plan_to_dict(
-        plan, predicted=performance, transport=transport, world="low", seed=np.int64(3)
-    )
+    return io.plan_to_dict(plan, predicted=performance, transport=transport, world="low", seed=3)
 
 
 def test_a_plan_reads_back_the_same(tmp_path, plan, document):
@@ -496,6 +505,13 @@ def test_a_plan_reads_back_the_same(tmp_path, plan, document):
     assert load["predicted"] == {"mass": 4.0, "time": 12.0, "work": 401.0}
     assert load["transport"] == {"time": 6.0, "work": 0.0}
     assert "simulated" not in load
+
+
+def test_numbers_of_numpy_and_jax_are_written(tmp_path, document):
+    document.update(seed=np.int64(4), total={"mass": jnp.asarray(1.5), "all": np.ones(2)})
+    io.write_plan(tmp_path / "plan.json", document)
+    _, data = io.read_plan(tmp_path / "plan.json")
+    assert (data["seed"], data["total"]) == (4, {"mass": 1.5, "all": [1.0, 1.0]})
 
 
 def refused_plan(path, match):
@@ -553,7 +569,7 @@ def test_bad_plans_are_neither_read_nor_written(tmp_path, document, change, matc
 )
 def test_files_that_are_no_plans_are_refused(tmp_path, text):
     (tmp_path / "plan.json").write_text(text)
-    refused_plan(tmp_path / "plan.json", "")
+    refused_plan(tmp_path / "plan.json", "plan")
 
 
 def test_plans_that_are_no_text_or_no_file_are_refused(tmp_path):

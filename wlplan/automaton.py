@@ -41,8 +41,8 @@ _NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != 
 class Schedule:
     """How hard `settle` works: `cycles` passes of `sweeps[k]` sweeps at spacing 2^k."""
 
-    cycles: int = 2
-    sweeps: tuple[int, ...] = (20, 40, 80)
+    cycles: int = 3
+    sweeps: tuple[int, ...] = (16, 24, 48, 48)
 
     @property
     def block(self) -> int:
@@ -239,9 +239,12 @@ def settle(
             f"{schedule.block} cells a side. Pad it, or use fewer levels in the schedule."
         )
     drop = cell_size * math.tan(repose_angle)
-    for _ in range(schedule.cycles):
-        height = _cycle(height, drop, terrain, schedule.sweeps)
-    return height
+
+    # A scan, so that the cycles share one compiled body.
+    def cycle(h: Array, _: None) -> tuple[Array, None]:
+        return _cycle(h, drop, terrain, schedule.sweeps), None
+
+    return lax.scan(cycle, height, None, length=schedule.cycles)[0]
 
 
 def steepest_slope(pile: Pile) -> Float[Array, ""]:

@@ -10,6 +10,7 @@ differentiable in the pose and in the volume.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,36 @@ STRIP_LENGTH = 4.5
 _ITERATIONS = 14
 
 
+class Strip(NamedTuple):
+    """The strip in front of a dig pose, on the cells of a pile."""
+
+    weight: Float[Array, "nx ny"]  # part of each cell inside the strip [1]
+    above: Float[Array, "nx ny"]  # soil above the floor, none in unseen cells [m]
+    along: Float[Array, "nx ny"]  # position along the heading [m]
+
+
+def strip_of(pile: Pile, pose: Pose, *, width: float) -> Strip:
+    """The strip as wide as the bucket that starts at a dig pose.
+
+    Args:
+        pile: The pile, or a window of it.
+        pose: Dig location and heading.
+        width: Width of the bucket [m].
+    """
+    cell = pile.cell_size
+    along, left = to_local(pose, *cell_centres(pile))
+    weight = (
+        jnp.clip((width / 2 - jnp.abs(left)) / cell + 0.5, 0.0, 1.0)
+        * jnp.clip(along / cell + 0.5, 0.0, 1.0)
+        * jnp.clip((STRIP_LENGTH - along) / cell + 0.5, 0.0, 1.0)
+    )
+    floor = jnp.zeros_like(pile.height) if pile.ground is None else pile.ground
+    above = jnp.maximum(pile.height - floor, 0.0)
+    if pile.valid is not None:
+        above = jnp.where(pile.valid, above, 0.0)
+    return Strip(weight, above, along)
+
+
 def excavate(
     pile: Pile, pose: Pose, volume: Float[Array, ""], *, width: float
 ) -> tuple[Pile, Float[Array, ""]]:
@@ -43,41 +74,32 @@ def excavate(
         The pile afterwards (not relaxed) and the volume that was taken [m^3]: `volume`, or less
         if the strip does not hold that much.
     """
-    cell = pile.cell_size
-    along, left = to_local(pose, *cell_centres(pile))
-    weight = (
-        jnp.clip((width / 2 - jnp.abs(left)) / cell + 0.5, 0.0, 1.0)
-        * jnp.clip(along / cell + 0.5, 0.0, 1.0)
-        * jnp.clip((STRIP_LENGTH - along) / cell + 0.5, 0.0, 1.0)
-    )
-    floor = jnp.zeros_like(pile.height) if pile.ground is None else pile.ground
-    above = jnp.maximum(pile.height - floor, 0.0)
-    if pile.valid is not None:
-        above = jnp.where(pile.valid, above, 0.0)
-    wanted = volume / cell**2
+    cell_area = pile.cell_size**2
+    strip = strip_of(pile, pose, width=width)
+    wanted = jnp.minimum(volume / cell_area, (strip.weight * strip.above).sum())
 
-    def cut(penetration: Array, weight: Array, above: Array, along: Array) -> Array:
-        return weight * jnp.maximum(above - _RISE * jnp.maximum(along - penetration, 0.0), 0.0)
+    def cut(penetration: Array, strip: Strip) -> Array:
+        rise = _RISE * jnp.maximum(strip.along - penetration, 0.0)
+        return strip.weight * jnp.maximum(strip.above - rise, 0.0)
 
-    strip = (weight, above, along)
     frozen = lax.stop_gradient(strip)
     goal = lax.stop_gradient(wanted)
 
     def bisect(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bracket
         middle = (low + high) / 2
-        short = cut(middle, *frozen).sum() < goal
+        short = cut(middle, frozen).sum() < goal
         return jnp.where(short, middle, low), jnp.where(short, high, middle)
 
     deepest = jnp.full_like(goal, STRIP_LENGTH)
-    shallowest = -jnp.maximum(frozen[1].max() / _RISE, cell)
+    shallowest = -jnp.maximum(frozen.above.max() / _RISE, pile.cell_size)
     low, high = lax.fori_loop(0, _ITERATIONS, bisect, (shallowest, deepest))
     # One Newton step from the bracket: exact to second order, and the implicit gradient.
     start = (low + high) / 2
-    amount = cut(start, *strip).sum()
-    _, rate = jax.jvp(lambda p: cut(p, *frozen).sum(), (start,), (jnp.ones_like(start),))
+    amount = cut(start, strip).sum()
+    _, rate = jax.jvp(lambda p: cut(p, frozen).sum(), (start,), (jnp.ones_like(start),))
     step = jnp.where(rate > 0.0, (wanted - amount) / jnp.where(rate > 0.0, rate, 1.0), 0.0)
     penetration = jnp.clip(start + step, shallowest, deepest)
     # The rest, a fraction of a per mille, is met by scaling the cut.
-    removed = take(cut(penetration, *strip), weight * above, wanted)
-    return pile.replace(height=pile.height - removed), removed.sum() * cell**2
+    removed = take(cut(penetration, strip), strip.weight * strip.above, wanted)
+    return pile.replace(height=pile.height - removed), wanted * cell_area

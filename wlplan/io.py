@@ -17,6 +17,7 @@ import logging
 import math
 import os
 import secrets
+import struct
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from importlib import resources
@@ -41,6 +42,10 @@ PLAN_FORMAT = "wlplan.plan/1"
 # 3.6 m window of the models, and most cells a side that are taken.
 _SHORTEST_SIDE = 4.0
 _MOST_CELLS = 4000
+# Largest difference in height on a map and largest coordinate [m]; beyond, units are wrong or a
+# nodata value was taken for a height.
+_MOST_RELIEF = 200.0
+_FARTHEST = 1.0e8
 # Coordinates above which whole kilometres, and heights above which whole hundreds of metres, are
 # taken off [m]: float32 resolves 1 mm at the one and 0.01 mm at the other.
 _FAR = 10_000.0
@@ -130,8 +135,8 @@ def _to_pile(scan: _Scan, ground: Array | np.ndarray | float | None) -> Pile:
         raise InputError(f"`height` has shape {height.shape}: it has to be 2-D, x by y.")
     shape = height.shape
     _check_size(shape, scan.cell_size)
-    if origin.shape != (2,) or not np.isfinite(origin).all():
-        raise InputError("`origin` has to be two finite numbers, x and y of the first cell.")
+    if origin.shape != (2,) or not (np.abs(origin) <= _FARTHEST).all():
+        raise InputError("`origin` has to be x and y of the first cell, two numbers in metres.")
     valid = _valid(scan.valid, shape)
     bad = int(np.sum(valid & ~np.isfinite(height)))
     if bad:
@@ -142,6 +147,11 @@ def _to_pile(scan: _Scan, ground: Array | np.ndarray | float | None) -> Pile:
     if not valid.any():
         raise InputError("no cell counts as seen: check the mask or the nodata value.")
     low, high = float(height[valid].min()), float(height[valid].max())
+    if not (high - low <= _MOST_RELIEF and abs(low) <= _FARTHEST):
+        raise InputError(
+            f"the heights run from {low:.6g} to {high:.6g} m, which is no pile: check the units "
+            f"and the nodata value."
+        )
     with np.errstate(invalid="ignore"):
         known = valid | ((height >= low) & (height <= high))
     height = fill_unseen(height, known)
@@ -153,9 +163,13 @@ def _to_pile(scan: _Scan, ground: Array | np.ndarray | float | None) -> Pile:
         floor = _real("ground", floor)
         if floor.shape != shape:
             raise InputError(f"`ground` has shape {floor.shape}, but `height` {shape}.")
-        if not np.isfinite(floor[valid]).all():
-            raise InputError("`ground` is NaN or infinite in cells that count as seen.")
-        floor = np.minimum(fill_unseen(floor, np.isfinite(floor)), height)
+        if not (np.abs(floor[valid] - low) <= _MOST_RELIEF).all():
+            raise InputError(
+                f"`ground` is NaN or more than {_MOST_RELIEF:g} m off the surface in cells that "
+                f"count as seen: check its units, or leave it out."
+            )
+        known = np.abs(floor - low) <= _MOST_RELIEF
+        floor = np.minimum(fill_unseen(floor, known), height)
 
     centre = origin + 0.5 * scan.cell_size * np.array(shape)
     origin = origin - np.where(np.abs(centre) > _FAR, 1000.0 * np.floor(centre / 1000.0), 0.0)
@@ -208,7 +222,8 @@ def _real(name: str, values: Any) -> np.ndarray:
     values = np.asarray(values)
     if values.dtype.kind not in "iuf":
         raise InputError(f"`{name}` holds {values.dtype} values: store real numbers.")
-    return values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a NaN of damaged bytes may be a signalling one
+        return values.astype(np.float64)
 
 
 def _floats(values: np.ndarray) -> Array:
@@ -217,8 +232,9 @@ def _floats(values: np.ndarray) -> Array:
 
 
 def _read_npz(path: Path) -> _Scan:
-    with np.load(path, allow_pickle=False) as archive:
-        if not isinstance(archive, np.lib.npyio.NpzFile):
+    with path.open("rb") as file:
+        archive = np.load(file, allow_pickle=False)
+        if isinstance(archive, np.ndarray):
             raise InputError("holds a single array: save it by np.savez with height and cell_size.")
         # Every field is read here, so that damage shows up here.
         fields = {name: archive[name] for name in archive.files}
@@ -273,8 +289,52 @@ def _read_geotiff(path: Path) -> _Scan:
 
 def _read_las(path: Path) -> _Scan:
     laspy = _optional("laspy")
-    cloud = laspy.read(path)
+    _check_las_header(path)
+    try:
+        with _mute_stderr():
+            # The parallel decompressor would set aside memory for as many points as a damaged
+            # chunk size asks for.
+            cloud = laspy.read(path, laz_backend=laspy.LazBackend.Lazrs)
+    except BaseException as error:
+        # A panic of the decompressor, which is written in Rust, is no `Exception`.
+        if type(error).__name__ != "PanicException":
+            raise
+        raise RuntimeError(str(error)) from error
     return _grid(np.stack([np.asarray(cloud[axis], np.float64) for axis in "xyz"], axis=-1))
+
+
+def _check_las_header(path: Path) -> None:
+    """Refuse counts that the file has no room for.
+
+    Their readers take them at their word: a damaged one runs for hours, or asks for more memory
+    than there is, which ends the process.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(255).ljust(255, b"\0")
+        # LAS 1.4 R15, table 3: where the points begin, the numbers of records and of points.
+        start, records, record_size, points = struct.unpack_from("<IIxHI", head, 96)
+        more_records, more_points = 0, 0
+        if head[25] >= 4:
+            more_records, more_points = struct.unpack_from("<IQ", head, 243)
+        # The headers of records take 54 and 60 bytes.
+        whole = head[:4] == b"LASF" and 54 * records <= start <= size - 8 >= 60 * more_records
+        points = max(points, more_points)
+        if whole and path.suffix.lower() == ".laz":
+            # The points begin with the place of the table of chunks, which begins with a version
+            # and their number; each chunk opens with a point as it is. Compression is not known
+            # to save more than 99.9 %.
+            file.seek(start)
+            (table,) = struct.unpack("<q", file.read(8))
+            whole = start < table <= size - 8 and points * record_size <= 1000 * size
+            if whole:
+                file.seek(table)
+                _, chunks = struct.unpack("<II", file.read(8))
+                whole = chunks * record_size <= size
+        elif whole:
+            whole = points * record_size <= size - start
+    if not whole:
+        raise InputError("is damaged or cut short, or no LAS file: copy or export it again.")
 
 
 # The number types of a PLY header, as numpy's.
@@ -589,6 +649,20 @@ def _silent(*names: str) -> Iterator[None]:
     finally:
         for logger, disabled in zip(loggers, before, strict=True):
             logger.disabled = disabled
+
+
+@contextlib.contextmanager
+def _mute_stderr() -> Iterator[None]:
+    """Send what other languages' libraries write to the process's stderr to nowhere."""
+    keep = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(keep, 2)
+        os.close(keep)
+        os.close(nowhere)
 
 
 def _one_line(error: object) -> str:

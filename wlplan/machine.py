@@ -44,7 +44,7 @@ class WheelLoader:
     # Struck volume with the bucket level, and heaped volume when fully tilted [m^3]. Brochure:
     # 2.3 to 2.7 struck, about 3.0 to 3.2 heaped.
     bucket_struck: float = 2.3
-    bucket_heaped: float = 3.0
+    bucket_heaped: float = 2.8
     # Height of the boom pivot above the ground [m], and boom length to the bucket pin [m].
     # Brochure drawing: 1.9 to 1.95 and 2.6 to 2.7.
     pivot_height: float = 1.90
@@ -88,18 +88,18 @@ class Soil:
 
     # Fitted to the forces and loads of discrete-element cycles, see docs/simulator.md.
     # Factor on the earthmoving force [1].
-    force_scale: float = 1.0
+    force_scale: float = 0.9
     # Inclination of the wedge of soil that rests against the bucket's back wall and acts as the
     # blade once the bucket is full [rad].
-    wall_inclination: float = math.radians(45.0)
+    wall_inclination: float = math.radians(53.0)
     # Fullness of the bucket at which that wedge is complete [1].
-    wall_fullness: float = 0.6
+    wall_fullness: float = 0.25
     # Resistance to the cutting edge a metre of width: at the surface [N/m] and as a multiple of
     # the overburden pressure at its depth [m].
-    edge_resistance: float = 1_000.0
-    edge_bearing: float = 0.3
+    edge_resistance: float = 8_000.0
+    edge_bearing: float = 0.33
     # Fastest flow of sliding soil a metre of width while the bucket digs [m^2/s].
-    slide_rate: float = 0.1
+    slide_rate: float = 0.03
 
     @property
     def repose_angle(self) -> float:

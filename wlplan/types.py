@@ -66,6 +66,16 @@ class Action:
     k_bk: Float[Array, "*batch"]  # bucket velocity gain [1], 0..5
 
 
+def action_vector(action: Action) -> Float[Array, "*batch 4"]:
+    """[delta_bm, k_bm, delta_bk, k_bk] along a last axis."""
+    return jnp.stack([action.delta_bm, action.k_bm, action.delta_bk, action.k_bk], axis=-1)
+
+
+def action_from(vector: Float[Array, "*batch 4"]) -> Action:
+    """The inverse of `action_vector`."""
+    return Action(*(vector[..., k] for k in range(4)))
+
+
 @no_type_check
 @struct.dataclass
 class Performance:

@@ -1,0 +1,62 @@
+"""Laws that hold for every stage, as assertions; tests/test_laws.py shows that they can fail."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def assert_volume_kept(before, after, *, relative=1e-6):
+    """The summed height is the same to `relative` of the total."""
+    before, after = np.asarray(before, np.float64).sum(), np.asarray(after, np.float64).sum()
+    assert abs(after - before) <= relative * abs(before), (
+        f"the volume changed from {before:.9g} to {after:.9g}"
+    )
+
+
+def assert_gradient(function, point, *, step=1e-6, relative=1e-4, absolute=0.0, skip=None):
+    """Reverse mode agrees with central differences, component by component, in float64.
+
+    Args:
+        function: Scalar function of a pytree.
+        point: Where to compare; float64 leaves.
+        step: Of the central difference.
+        relative: Largest error over the larger of the two, or over the largest component.
+        absolute: Errors below this count as none.
+        skip: Largest number of components that may disagree because a kink lies within `step`:
+            one whose two one-sided differences disagree. None: no component may.
+
+    Returns:
+        The number of components at kinks.
+    """
+    leaves, tree = jax.tree.flatten(point)
+    sizes = [leaf.size for leaf in leaves]
+    flat = np.concatenate([np.asarray(leaf, np.float64).ravel() for leaf in leaves])
+
+    def value(vector):
+        parts = np.split(vector, np.cumsum(sizes)[:-1])
+        rebuilt = [jnp.asarray(p.reshape(leaf.shape)) for p, leaf in zip(parts, leaves, strict=True)]
+        return function(jax.tree.unflatten(tree, rebuilt))
+
+    compiled = jax.jit(value)
+    exact = np.asarray(jax.jit(jax.grad(value))(flat))
+    assert np.isfinite(exact).all(), "the gradient is not finite"
+    here = float(compiled(flat))
+    kinks, errors = 0, []
+    scale = np.abs(exact).max()
+    for k in range(flat.size):
+        ahead, behind = flat.copy(), flat.copy()
+        ahead[k] += step
+        behind[k] -= step
+        up, down = float(compiled(ahead)), float(compiled(behind))
+        central = (up - down) / (2 * step)
+        error = abs(central - exact[k])
+        bound = max(relative * max(abs(central), abs(exact[k]), 1e-3 * scale), absolute)
+        if error > bound:
+            one_sided = abs((up - here) - (here - down)) / step
+            if skip is not None and one_sided > 0.5 * error:
+                kinks += 1
+                continue
+            errors.append((k, float(exact[k]), central))
+    assert not errors, f"gradient and central difference differ: {errors[:5]}"
+    assert skip is None or kinks <= skip, f"{kinks} components at kinks, {skip} allowed"
+    return kinks

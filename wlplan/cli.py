@@ -1,0 +1,598 @@
+"""The command line: `wlplan plan`, `simulate`, `diggability`, `collect`, `train`, `evaluate`.
+
+Results go to stdout, progress and remarks to stderr. Whatever is wrong with the input comes back as
+one line on stderr and exit code 2. What is slow to import is imported inside the commands, so that
+help and usage errors come at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import logging
+import math
+import os
+import secrets
+import shutil
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from wlplan.errors import InputError
+from wlplan.units import ACTION_HIGH, ACTION_LOW
+
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+    from wlplan.planner import PlanResult
+    from wlplan.transport import Receiver
+    from wlplan.types import Performance, Pile, World
+
+# Names that the modules behind define, repeated here to keep help fast; a test compares them.
+WORLDS = ("low", "high", "hybrid", "simulator")
+PLANNERS = ("gradient", "greedy", "nominal")
+OBJECTIVES = ("efficiency", "productivity", "energy")
+
+# What stands for the pile that ships with the package where a file is asked for.
+BUNDLED = "bundled"
+
+_PILE_ENDINGS = (".npz", ".tif", ".tiff", ".las", ".laz", ".ply")
+# Most loads of a plan, most locations of a map, and most cycles of a data set, which is 27 GB.
+_MOST_LOADS, _MOST_LOCATIONS, _MOST_CYCLES = 500, 10_000, 1_000_000
+# Farthest that a truck may stand from the middle of the map [m].
+_FARTHEST_TRUCK = 500.0
+# Seconds between two lines of progress where no bar can be shown.
+_PROGRESS_PAUSE = 10.0
+_MAP_FORMAT = "wlplan.diggability/1"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: Words after `wlplan`; by default those of the process.
+
+    Returns:
+        Exit code: 0 done, 1 a fault of ours, 2 bad input or usage, 130 interrupted.
+    """
+    if "_WLPLAN_COMPLETE" in os.environ:  # the shell asks for completions
+        wlplan.main(prog_name="wlplan")
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    with warnings.catch_warnings():
+        if not sys.warnoptions:
+            warnings.simplefilter("ignore")
+        _quieten()
+        try:
+            with wlplan.make_context("wlplan", words) as context:
+                wlplan.invoke(context)
+            sys.stdout.flush()
+            return 0
+        except click.exceptions.Exit as stop:
+            return stop.exit_code
+        except click.ClickException as error:
+            return _fail(_usage_message(error), 2)
+        except InputError as error:
+            return _fail(str(error), 2)
+        except (KeyboardInterrupt, click.Abort):
+            return _fail("interrupted; nothing was written by this command.", 130)
+        except BrokenPipeError:
+            # Whoever read our output has closed it: end quietly, also when Python flushes stdout.
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        except MemoryError:
+            return _fail("out of memory: use a smaller pile, or fewer loads or locations.", 2)
+        except OSError as error:
+            place = f"{error.filename}: " if error.filename else ""
+            reason = error.strerror or str(error)
+            return _fail(f"{place}{reason}: check the path and the free space.", 2)
+        except Exception as error:
+            if os.environ.get("WLPLAN_DEBUG"):
+                traceback.print_exc()
+            return _fail(
+                f"this should not happen ({type(error).__name__}: {error}): please report it; "
+                f"WLPLAN_DEBUG=1 shows where.",
+                1,
+            )
+
+
+def _fail(message: str, code: int) -> int:
+    text = " ".join(message.split())
+    with contextlib.suppress(OSError, ValueError):
+        print(f"error: {text if len(text) <= 600 else text[:597] + '...'}", file=sys.stderr)
+    return code
+
+
+def _usage_message(error: click.ClickException) -> str:
+    message = error.format_message().rstrip(".")
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context is not None else "wlplan"
+    return f"{message}: see `{command} --help`."
+
+
+def _quieten() -> None:
+    """Keep libraries from writing to stderr, and let stdout take any character."""
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    logging.getLogger("jax._src.xla_bridge").setLevel(logging.ERROR)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, OSError, ValueError):
+            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+
+
+# --- options
+
+
+class _Numbers(click.ParamType):
+    """Numbers with commas between them."""
+
+    def __init__(self, form: str, least: int):
+        self.name = form
+        self._form = form
+        self._counts = range(least, form.count(",") + 2)
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return self._form
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) not in self._counts or not all(math.isfinite(n) for n in numbers):
+            self.fail(f"{value!r} is not of the form {self._form}, with finite numbers", param, ctx)
+        return numbers
+
+
+class _ActionNumbers(_Numbers):
+    """The four parameters of the bucket-filling controller, inside their box."""
+
+    def __init__(self) -> None:
+        super().__init__("DELTA_BM,K_BM,DELTA_BK,K_BK", 4)
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        numbers = super().convert(value, param, ctx)
+        for name, number, low, high in zip(
+            self.name.lower().split(","), numbers, ACTION_LOW, ACTION_HIGH, strict=True
+        ):
+            if not low <= number <= high:
+                self.fail(
+                    f"{name} is {number:g}, outside its range {low:g} to {high:g}", param, ctx
+                )
+        return numbers
+
+
+def _options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Several click options at once, then those that every command has."""
+    common = (
+        click.option(
+            "--seed",
+            type=click.IntRange(0, 2**31 - 1),
+            default=0,
+            show_default=True,
+            help="Seed of everything random.",
+        ),
+        click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout."),
+    )
+
+    def decorate(command: Any) -> Any:
+        for option in reversed((*options, *common)):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+_pile_argument = click.argument("pile_file", metavar="[PILE]", default=BUNDLED)
+_world_option = click.option(
+    "--world",
+    "world_name",
+    type=click.Choice(WORLDS),
+    default="low",
+    show_default=True,
+    help="What predicts: a learned world or the simulator.",
+)
+_model_option = click.option(
+    "--model",
+    metavar="DIR",
+    default=None,
+    help="Model from `wlplan train` in place of the one that ships with the package.",
+)
+_truck_option = click.option(
+    "--truck",
+    type=_Numbers("X,Y[,HEADING_DEG]", 2),
+    default=None,
+    help="Where the loader stands when it dumps [m], in the frame of the scan, and which way it "
+    "then heads; without a heading the one with the shortest ways. Default: 12 m west of the pile.",
+)
+_out_option = click.option(
+    "--out", metavar="DIR", default=None, help="Folder to write to; made if it is missing."
+)
+
+
+@click.group(
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(package_name="wlplan", message="%(prog)s %(version)s")
+@click.pass_context
+def wlplan(context: click.Context) -> None:
+    """Plan the bucket loads of a wheel loader from a scan of the pile.
+
+    PILE is a height map (.npz, GeoTIFF) or a point cloud (.las, .laz, .ply) in metres; without it,
+    or as the word `bundled`, the pile that ships with the package is used.
+    """
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
+
+
+# --- plan
+
+
+@wlplan.command()
+@_pile_argument
+@_options(
+    click.option(
+        "--loads",
+        type=click.IntRange(1, _MOST_LOADS),
+        default=15,
+        show_default=True,
+        help="Number of bucket loads.",
+    ),
+    _world_option,
+    click.option(
+        "--planner", type=click.Choice(PLANNERS), default="gradient", show_default=True, help="How."
+    ),
+    click.option(
+        "--objective",
+        type=click.Choice(OBJECTIVES),
+        default="efficiency",
+        show_default=True,
+        help="What for.",
+    ),
+    _truck_option,
+    _model_option,
+    _out_option,
+)
+def plan(
+    pile_file: str,
+    loads: int,
+    world_name: str,
+    planner: str,
+    objective: str,
+    truck: tuple[float, ...] | None,
+    model: str | None,
+    out: str | None,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Plan the next loads from PILE and play the plan in the simulator.
+
+    With --out: plan.json, plan.png, totals.png and report.html, which shows everything.
+    """
+    _check_pile_name(pile_file)
+    folder = None if out is None else _checked_folder(out)
+
+    from wlplan.io import plan_to_dict
+    from wlplan.planner import plan_loads, play
+
+    pile, source = _read_pile(pile_file)
+    receiver = _receiver(pile, truck)
+    world = _load_world(world_name, model)
+    with _Progress() as progress:
+        with _Stopwatch() as planning:
+            planned = _ready(
+                plan_loads(
+                    world,
+                    pile,
+                    loads=loads,
+                    objective=objective,
+                    planner=planner,
+                    receiver=receiver,
+                    seed=seed,
+                    progress=progress,
+                )
+            )
+        with _Stopwatch() as playing:
+            simulator = _load_world("simulator", None)
+            if world_name == "simulator":
+                simulated = planned
+            else:
+                progress("simulator", 0, 1, None)
+                simulated = _ready(
+                    play(simulator, pile, planned.plan, objective=objective, receiver=receiver)
+                )
+                progress("simulator", 1, 1, None)
+
+    document = plan_to_dict(
+        planned.plan,
+        predicted=planned.rollout.performance,
+        simulated=simulated.rollout.performance,
+        transport={"time": planned.transport_time, "work": planned.transport_work},
+        pile=source,
+        world=world_name,
+        planner=planner,
+        objective=objective,
+        seed=seed,
+        receiver=_receiver_fields(receiver),
+        total={
+            "predicted": _totals(planned.rollout.performance, planned.cost),
+            "simulated": _totals(simulated.rollout.performance, simulated.cost),
+            "transport": {
+                "time": _sum(planned.transport_time),
+                "work": _sum(planned.transport_work),
+            },
+        },
+        ledger=_ledger(pile, simulated, simulator),
+    )
+    text = _json_text(document)
+    seconds = {"planning": planning.text(), "simulator": playing.text()}
+    if folder is not None:
+        _write_plan(folder, document, pile, planned, simulated, receiver, seconds)
+    _remark_on_ledger(document["ledger"])
+    if as_json:
+        click.echo(text)
+        return
+    _print_plan(document)
+    print(f"planning {seconds['planning']}; simulator {seconds['simulator']}")
+    if folder is None:
+        print("nothing written: --out DIR writes the plan, the figures and a report")
+    else:
+        print(f"written: {folder / 'report.html'}, and plan.json, plan.png, totals.png beside it")
+
+
+def _write_plan(
+    folder: Path,
+    document: Mapping[str, Any],
+    pile: Pile,
+    planned: PlanResult,
+    simulated: PlanResult,
+    receiver: Receiver,
+    seconds: Mapping[str, str],
+) -> None:
+    from wlplan import plots
+    from wlplan.io import write_bytes_atomic, write_plan
+    from wlplan.report import write_report
+
+    count = len(document["loads"])
+    maps = plots.png_bytes(
+        plots.plan_figure(
+            pile,
+            simulated.rollout.pile,
+            planned.plan,
+            receiver=receiver,
+            after_title=f"After {count} load{'s' if count > 1 else ''} in the simulator",
+        )
+    )
+    totals = plots.png_bytes(
+        plots.totals_figure(planned.rollout.performance, simulated.rollout.performance)
+    )
+    with _staged(folder) as staging:
+        write_plan(staging / "plan.json", document)
+        write_bytes_atomic(staging / "plan.png", maps)
+        write_bytes_atomic(staging / "totals.png", totals)
+        write_report(
+            staging,
+            document,
+            figures=((maps, "The pile and the digs"), (totals, "Predicted beside simulated")),
+            settings={f"{name}, wall clock": text for name, text in seconds.items()},
+        )
+
+
+# --- simulate
+
+
+@wlplan.command()
+@click.argument("pile_file", metavar="PILE")
+@click.argument("plan_file", metavar="PLAN.json")
+@_options(_truck_option)
+def simulate(
+    pile_file: str, plan_file: str, truck: tuple[float, ...] | None, seed: int, as_json: bool
+) -> None:
+    """Play PLAN.json in the simulator on PILE and compare with what was predicted.
+
+    The truck is that of the plan, unless --truck is given. The simulator has no randomness, so
+    --seed changes nothing.
+    """
+    _check_pile_name(pile_file)
+
+    from wlplan.io import plan_to_dict, read_plan
+    from wlplan.planner import play
+
+    loading_plan, given = read_plan(plan_file)
+    pile, source = _read_pile(pile_file)
+    hashes = [(record if isinstance(record, dict) else {}).get("sha256") for record in (
+        given.get("pile"), source)]
+    if None not in hashes and hashes[0] != hashes[1]:
+        _remark("the plan was made for another pile file than this one")
+    objective = given.get("objective")
+    objective = objective if objective in OBJECTIVES else OBJECTIVES[0]
+    receiver = _receiver(pile, truck if truck is not None else _truck_of(given))
+    with _Progress() as progress, _Stopwatch() as playing:
+        progress("simulator", 0, 1, None)
+        simulator = _load_world("simulator", None)
+        played = _ready(play(simulator, pile, loading_plan, objective=objective, receiver=receiver))
+        progress("simulator", 1, 1, None)
+
+    predicted = _predicted_of(given)
+    total = {
+        "simulated": _totals(played.rollout.performance, played.cost),
+        "transport": {"time": _sum(played.transport_time), "work": _sum(played.transport_work)},
+    }
+    if predicted is not None:
+        total = {"predicted": _given_totals(predicted, given), **total}
+    document = plan_to_dict(
+        loading_plan,
+        predicted=predicted,
+        simulated=played.rollout.performance,
+        transport={"time": played.transport_time, "work": played.transport_work},
+        pile=source,
+        **{name: given[name] for name in ("world", "planner", "seed") if name in given},
+        objective=objective,
+        receiver=_receiver_fields(receiver),
+        total=total,
+        ledger=_ledger(pile, played, simulator),
+    )
+    text = _json_text(document)
+    _remark_on_ledger(document["ledger"])
+    if as_json:
+        click.echo(text)
+        return
+    _print_plan(document)
+    print(f"simulator {playing.text()}")
+
+
+def _truck_of(document: Mapping[str, Any]) -> tuple[float, ...] | None:
+    """The truck that a plan was made for, as of the option; None if it names none."""
+    record = document.get("receiver")
+    values = [record.get(name) if isinstance(record, dict) else None for name in _RECEIVER_FIELDS]
+    if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+        return None
+    x, y, heading = (float(v) for v in values if v is not None)
+    return x, y, math.degrees(heading)
+
+
+def _predicted_of(document: Mapping[str, Any]) -> Performance | None:
+    """What a plan predicts of its loads; None unless it does of all of them."""
+    import numpy as np
+
+    from wlplan.types import Performance
+
+    rows = []
+    for load in document["loads"]:
+        record = load.get("predicted")
+        values = [record.get(q) if isinstance(record, dict) else None for q in _QUANTITIES]
+        if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
+            return None
+        rows.append(values)
+    return Performance(*np.array(rows, dtype=float).T)
+
+
+def _given_totals(predicted: Performance, document: Mapping[str, Any]) -> dict[str, float]:
+    totals = _totals(predicted, math.nan)
+    del totals["cost"]
+    try:
+        cost = document["total"]["predicted"]["cost"]
+    except (KeyError, TypeError):
+        cost = None
+    return {**totals, "cost": float(cost)} if isinstance(cost, int | float) else totals
+
+
+# --- diggability
+
+
+@wlplan.command()
+@_pile_argument
+@_options(
+    click.option(
+        "--locations",
+        type=click.IntRange(1, _MOST_LOCATIONS),
+        default=150,
+        show_default=True,
+        help="Number of dig locations around the pile.",
+    ),
+    click.option(
+        "--action",
+        type=_ActionNumbers(),
+        default="0.68,4.51,0.17,4.46",
+        show_default=True,
+        help="Parameters of the bucket-filling controller, the same everywhere.",
+    ),
+    _world_option,
+    _model_option,
+    _out_option,
+)
+def diggability(
+    pile_file: str,
+    locations: int,
+    action: tuple[float, ...],
+    world_name: str,
+    model: str | None,
+    out: str | None,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Map what one action would yield all around PILE.
+
+    With --out: diggability.png and diggability.json. Nothing is random, so --seed changes nothing.
+    """
+    _check_pile_name(pile_file)
+    folder = None if out is None else _checked_folder(out)
+
+    import numpy as np
+
+    from wlplan.diggability import diggability_map
+    from wlplan.types import Action
+
+    pile, source = _read_pile(pile_file)
+    world = _load_world(world_name, model)
+    with _Progress() as progress, _Stopwatch() as mapping:
+        progress("diggability", 0, 1, None)
+        found = _ready(diggability_map(world, pile, locations=locations, action=Action(*action)))
+        progress("diggability", 1, 1, None)
+
+    records = {
+        name: np.asarray(getattr(part, name), np.float64)
+        for part in (found.pose, found.performance)
+        for name in (field.name for field in dataclasses.fields(part))
+    }
+    summary = {
+        q: {
+            "least": float(records[q].min()),
+            "median": float(np.median(records[q])),
+            "most": float(records[q].max()),
+        }
+        for q in _QUANTITIES
+    }
+    names = [field.name for field in dataclasses.fields(Action)]
+    document = {
+        "format": _MAP_FORMAT,
+        "pile": source,
+        "world": world_name,
+        "action": dict(zip(names, action, strict=True)),
+        "summary": summary,
+        "locations": [
+            {name: float(values[n]) for name, values in records.items()} for n in range(locations)
+        ],
+    }
+    text = _json_text(document)
+    if folder is not None:
+        from wlplan import plots
+        from wlplan.io import write_bytes_atomic, write_text_atomic
+
+        png = plots.png_bytes(plots.diggability_figure(pile, found))
+        with _staged(folder) as staging:
+            write_bytes_atomic(staging / "diggability.png", png)
+            write_text_atomic(staging / "diggability.json", text + "\n")
+    if as_json:
+        click.echo(text)
+        return
+    table = _table(f"{locations} locations around {source['file']}, {world_name} world")
+    for column in ("", "least", "median", "most", "most at x [m]", "y [m]", "heading [°]"):
+        table.add_column(column, justify="left" if not column else "right")
+    for q, (title, unit, digits) in _QUANTITIES.items():
+        best = int(records[q].argmax())
+        table.add_row(
+            f"{title} [{unit}]",
+            *(f"{value:.{digits}f}" for value in summary[q].values()),
+            f"{records['x'][best]:.2f}",
+            f"{records['y'][best]:.2f}",
+            f"{math.degrees(records['heading'][best]):.0f}",
+        )
+    _print_table(table)
+    print(f"map {mapping.text()}")
+    if folder is not None:
+        print(f"written: {folder / 'diggability.png'}, and diggability.json beside it")

@@ -1,0 +1,124 @@
+"""What every planner optimises: decisions for N loadings, and what they cost."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from wlplan.objective import Objective, loading_cost
+from wlplan.planner.toe import Toe, pose_at
+from wlplan.rollout import closed_loop
+from wlplan.transport import Receiver, transport
+from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose, Rollout, World, action_from
+from wlplan.units import ACTION_HIGH, ACTION_LOW
+
+
+@no_type_check
+@struct.dataclass
+class Job:
+    """A pile to load from, and for what."""
+
+    world: World
+    pile: Pile
+    toe: Toe
+    receiver: Receiver
+    objective: Objective = struct.field(pytree_node=False)
+
+
+@no_type_check
+@struct.dataclass
+class Decisions:
+    """What a planner chooses of loadings; unbounded, so that any value is a plan."""
+
+    position: Float[Array, "*n"]  # along the toe contour, in parts of its length
+    offset: Float[Array, "*n"]  # heading offset before squashing
+    action: Float[Array, "*n 4"]  # action parameters before squashing
+
+
+@no_type_check
+@struct.dataclass
+class Outcome:
+    """A played plan."""
+
+    plan: LoadingPlan  # leaves (N,)
+    rollout: Rollout
+    transport_time: Float[Array, "n"]  # [s]
+    transport_work: Float[Array, "n"]  # [kJ]
+    costs: Float[Array, "n"]  # of the loadings
+    cost: Float[Array, ""]  # their sum
+
+
+_LOW = np.asarray(ACTION_LOW)
+_RANGE = np.asarray(ACTION_HIGH) - _LOW
+
+
+def squash(raw: Float[Array, "*n 4"]) -> Action:
+    """Action inside its box."""
+    low, span = jnp.asarray(_LOW, raw.dtype), jnp.asarray(_RANGE, raw.dtype)
+    return action_from(low.reshape((1,) * (raw.ndim - 1) + (4,)) + jax.nn.sigmoid(raw) * (
+        span.reshape((1,) * (raw.ndim - 1) + (4,))
+    ))
+
+
+def unsquash(vector: np.ndarray) -> np.ndarray:
+    """Inverse of `squash` for vectors; the edges of the box are moved in by a hundredth."""
+    part = np.clip((vector - _LOW) / _RANGE, 0.01, 0.99)
+    return np.log(part / (1.0 - part))
+
+
+def decide(job: Job, pile: Pile, decisions: Decisions) -> tuple[Pose, Action]:
+    """Pose and action of one loading on the pile as it is."""
+    return pose_at(job.toe, pile, decisions.position, decisions.offset), squash(decisions.action)
+
+
+def _judged(job: Job, plan: LoadingPlan, outcome: Rollout) -> Outcome:
+    time, work = jax.vmap(lambda pose, mass: transport(pose, job.receiver, mass))(
+        plan.pose, outcome.performance.mass
+    )
+    costs = loading_cost(job.objective, outcome.performance, time, work)
+    return Outcome(
+        plan=plan,
+        rollout=outcome,
+        transport_time=time,
+        transport_work=work,
+        costs=costs,
+        cost=costs.sum(),
+    )
+
+
+def play_decisions(job: Job, decisions: Decisions) -> Outcome:
+    """Plays decisions, leaves with leading axis N, each on the pile that the ones before left."""
+    outcome, plan = closed_loop(
+        job.world, job.pile, decisions, lambda pile, d: decide(job, pile, d)
+    )
+    return _judged(job, plan, outcome)
+
+
+def play_plan(job: Job, plan: LoadingPlan) -> Outcome:
+    """Plays a plan with its poses as they are."""
+    outcome, plan = closed_loop(
+        job.world, job.pile, plan, lambda _, loading: (loading.pose, loading.action)
+    )
+    return _judged(job, plan, outcome)
+
+
+def cost_of_one(job: Job, pile: Pile, decisions: Decisions) -> Float[Array, ""]:
+    """Cost of a single loading on a given pile; what becomes of the pile is not computed."""
+    pose, action = decide(job, pile, decisions)
+    _, performance = job.world(pile, pose, action)
+    time, work = transport(pose, job.receiver, performance.mass)
+    return loading_cost(job.objective, performance, time, work)
+
+
+def load_once(
+    job: Job, pile: Pile, decisions: Decisions
+) -> tuple[Pile, Performance, Pose, Action]:
+    """One loading."""
+    pose, action = decide(job, pile, decisions)
+    pile, performance = job.world(pile, pose, action)
+    return pile, performance, pose, action

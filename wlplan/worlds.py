@@ -1,0 +1,79 @@
+"""The worlds that come with the package, by name."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import no_type_check
+
+from flax import struct
+from jax import lax
+
+from wlplan.automaton import DEFAULT_SCHEDULE, Schedule, settle_window, window_of
+from wlplan.characteristics import as_vector, characteristics
+from wlplan.errors import InputError
+from wlplan.excavation import excavate
+from wlplan.heightmap import sample_local
+from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
+from wlplan.models.performance import PerformanceModel
+from wlplan.simulator import Simulator
+from wlplan.training import load_model
+from wlplan.types import Action, Performance, Pile, Pose, World, action_vector
+from wlplan.units import KG_PER_TONNE
+
+WORLDS = ("low", "high", "hybrid", "simulator")
+"""Names that `load_world` knows."""
+
+
+@no_type_check
+@struct.dataclass
+class LowWorld:
+    """The low-dimensional world: ψ_low, mass removal along the strip, automaton. Paper, 3.6."""
+
+    model: PerformanceModel
+    machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
+    soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
+    schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
+
+    def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+        """The pile and the performance after one loading.
+
+        Where the strip holds less than the model predicts, the load is what is there.
+        """
+        local = characteristics(sample_local(pile, pose))
+        predicted = self.model(as_vector(local), action_vector(action))
+        window, start = window_of(pile, pose)
+        per_volume = self.soil.density / KG_PER_TONNE
+        dug, volume = excavate(
+            window, pose, predicted.mass / per_volume, width=self.machine.bucket_width
+        )
+        settled = settle_window(dug, repose_angle=self.soil.repose_angle, schedule=self.schedule)
+        after = pile.replace(height=lax.dynamic_update_slice(pile.height, settled, start))
+        return after, predicted.replace(mass=volume * per_volume)
+
+
+def pretrained_path(name: str) -> Path:
+    """Directory of the weights that ship with the package."""
+    return Path(str(resources.files("wlplan") / "pretrained" / name))
+
+
+def load_world(name: str, *, model: str | Path | None = None) -> World:
+    """A world by name.
+
+    Args:
+        name: "low" (ψ_low and the automaton) or "simulator"; "high" and "hybrid" need models that
+            are not part of the package yet.
+        model: Directory of a trained model to use in place of the pretrained one.
+
+    Raises:
+        InputError: If the name is unknown, or a model is missing or unusable.
+    """
+    if name == "simulator":
+        return Simulator()
+    if name == "low":
+        return LowWorld(load_model(pretrained_path("psi_low") if model is None else Path(model)))
+    if name in WORLDS:
+        raise InputError(
+            f"the {name} world needs ψ_high, which is not trained yet; use low or simulator"
+        )
+    raise InputError(f"unknown world {name!r}; choose one of {', '.join(WORLDS)}")
