@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except InputError as error:
             return _fail(str(error), 2)
         except (KeyboardInterrupt, click.Abort):
-            return _fail("interrupted; nothing was written by this command.", 130)
+            return _fail("interrupted: nothing half-written is left; run it again.", 130)
         except BrokenPipeError:
             # Whoever read our output has closed it: end quietly, also when Python flushes stdout.
             with contextlib.suppress(OSError, ValueError):
@@ -414,8 +414,10 @@ def simulate(
 
     loading_plan, given = read_plan(plan_file)
     pile, source = _read_pile(pile_file)
-    hashes = [(record if isinstance(record, dict) else {}).get("sha256") for record in (
-        given.get("pile"), source)]
+    hashes = [
+        (record if isinstance(record, dict) else {}).get("sha256")
+        for record in (given.get("pile"), source)
+    ]
     if None not in hashes and hashes[0] != hashes[1]:
         _remark("the plan was made for another pile file than this one")
     objective = given.get("objective")
@@ -596,3 +598,502 @@ def diggability(
     print(f"map {mapping.text()}")
     if folder is not None:
         print(f"written: {folder / 'diggability.png'}, and diggability.json beside it")
+
+
+# --- data and models
+
+
+@wlplan.command()
+@_options(
+    click.option(
+        "--cycles",
+        type=click.IntRange(1, _MOST_CYCLES),
+        default=10_800,
+        show_default=True,
+        help="Number of loading cycles.",
+    ),
+    click.option("--out", metavar="DATA.zarr", required=True, help="Data set to write."),
+)
+def collect(cycles: int, out: str, seed: int, as_json: bool) -> None:
+    """Play random loading cycles in the simulator and store them as training data.
+
+    Interrupted, the same command goes on where it stopped.
+    """
+    _check_not_a_file(out)
+
+    from wlplan.dataset import collect as collect_cycles
+
+    with _Progress() as progress, _Stopwatch() as playing:
+        collect_cycles(
+            out,
+            cycles=cycles,
+            seed=seed,
+            progress=lambda done, total: progress("cycles", done, total, None),
+        )
+    if as_json:
+        click.echo(_json_text({"out": out, "cycles": cycles, "seed": seed}))
+        return
+    print(f"{cycles} cycles in {out}; {playing.text()}")
+
+
+@wlplan.command()
+@click.argument("kind", metavar="MODEL", type=click.Choice(("psi-low",)))
+@_options(
+    click.option("--data", metavar="DATA.zarr", required=True, help="Data set to train on."),
+    click.option("--out", metavar="DIR", required=True, help="Folder of the model."),
+    click.option(
+        "--epochs",
+        type=click.IntRange(1, 100_000),
+        default=300,
+        show_default=True,
+        help="Passes over the data.",
+    ),
+)
+def train(kind: str, data: str, out: str, epochs: int, seed: int, as_json: bool) -> None:
+    """Train MODEL (psi-low) on a data set and report its errors on cycles that it has not seen."""
+    _check_is_folder(data, "data set", "wlplan collect")
+    _checked_folder(out)
+
+    from wlplan.dataset import open_dataset
+    from wlplan.training import train_psi_low
+
+    dataset = open_dataset(data)
+    with _Progress() as progress, _Stopwatch() as training:
+        _, report = train_psi_low(
+            dataset,
+            out=out,
+            seed=seed,
+            epochs=epochs,
+            progress=lambda done, total: progress("epochs", done, total, None),
+        )
+    if as_json:
+        click.echo(_json_text({"model": kind, "out": out, "held_out": report.as_dict()}))
+        return
+    _print_errors(f"{kind}, held-out part of {data}", report.as_dict())
+    print(f"training {training.text()}")
+    print(f"written: {out}")
+
+
+@wlplan.command()
+@_options(
+    click.option("--data", metavar="DATA.zarr", required=True, help="Data set to compare with."),
+    click.option(
+        "--model", metavar="DIR", default=None, help="Model; default: the one that ships."
+    ),
+)
+def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
+    """Report the errors of a model on simulated cycles.
+
+    Of the data set that it was trained on, only the part that was held out counts. The split
+    belongs to the model, so --seed changes nothing.
+    """
+    _check_is_folder(data, "data set", "wlplan collect")
+    if model is not None:
+        _check_is_folder(model, "model", "wlplan train")
+
+    from wlplan.dataset import open_dataset
+    from wlplan.training import evaluate_psi_low, held_out, load_model, read_description
+    from wlplan.worlds import pretrained_path
+
+    folder = pretrained_path("psi_low") if model is None else Path(model)
+    description, predictor = read_description(folder), load_model(folder)
+    dataset = open_dataset(data)
+    part = held_out(dataset, description)
+    report = evaluate_psi_low(predictor, part).as_dict()
+    if as_json:
+        click.echo(_json_text({"model": "psi-low", "data": data, "errors": report}))
+        return
+    which = "held-out part" if len(part) < len(dataset) else "all cycles"
+    _print_errors(f"psi-low, {which} of {data}", report)
+
+
+def _print_errors(title: str, report: Mapping[str, Any]) -> None:
+    table = _table(title)
+    for column in ("", "cycles", "mass", "time", "work"):
+        table.add_column(column, justify="left" if not column else "right")
+    kinds = (
+        ("mean_relative", "mean relative error", lambda v, unit: f"{100.0 * v:.2f} %"),
+        ("mean_absolute", "mean absolute error", lambda v, unit: f"{v:.3g} {unit}"),
+        ("total_relative", "error of the sum", lambda v, unit: f"{100.0 * v:+.2f} %"),
+    )
+    loaded = f"loads over {report['loaded_mass']:g} t"
+    for name, which in (("loaded", loaded), ("every", "all valid cycles")):
+        part = report[name]
+        for key, label, write in kinds:
+            cells = (write(part[key][q], unit) for q, (_, unit, _) in _QUANTITIES.items())
+            table.add_row(f"{label}, {which}", str(part["cycles"]), *cells)
+    _print_table(table)
+
+
+# --- checks that need nothing heavy
+
+
+def _check_pile_name(name: str) -> None:
+    if name == BUNDLED:
+        return
+    if os.path.isdir(name):
+        raise InputError(f"{name}: is a folder: name the pile file itself.")
+    if not os.path.exists(name):
+        raise InputError(f"{name}: no such pile file: check the name.")
+    if Path(name).suffix.lower() not in _PILE_ENDINGS:
+        raise InputError(
+            f"{name}: unknown kind of pile file: use one of {', '.join(_PILE_ENDINGS)}."
+        )
+
+
+def _check_not_a_file(name: str) -> None:
+    if os.path.lexists(name) and not os.path.isdir(name):
+        raise InputError(f"{name}: is a file: name a folder to write to.")
+
+
+def _check_is_folder(name: str, what: str, maker: str) -> None:
+    if not os.path.lexists(name):
+        raise InputError(f"{name}: no such {what}: check the name, or make it with `{maker}`.")
+    if not os.path.isdir(name):
+        raise InputError(f"{name}: is a file: a {what} is a folder, made with `{maker}`.")
+
+
+def _checked_folder(name: str) -> Path:
+    """A folder to write to, found out to be possible before anything long is begun."""
+    _check_not_a_file(name)
+    folder = Path(name)
+    place = folder.absolute()
+    while not os.path.lexists(place):
+        place = place.parent
+    if not place.is_dir():
+        raise InputError(f"{name}: {place} is a file: name a folder to write to.")
+    probe = place / f".wlplan-{secrets.token_hex(6)}.tmp"
+    try:
+        probe.mkdir()
+        probe.rmdir()
+    except OSError as error:
+        raise InputError(
+            f"{name}: cannot be written ({error.strerror or error}): choose another folder."
+        ) from error
+    return folder
+
+
+@contextlib.contextmanager
+def _staged(folder: Path) -> Iterator[Path]:
+    """A hidden folder to write to, whose files move into place once all are there.
+
+    Other files in the folder stay. If writing fails or is interrupted, the folder is as it was.
+    """
+    exists = folder.is_dir()
+    if not exists:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    # Inside or beside the folder, so that moving is renaming on one file system.
+    name = f".{folder.name or 'wlplan'}.{secrets.token_hex(6)}.tmp"
+    staging = folder / name if exists else folder.with_name(name)
+    staging.mkdir()
+    try:
+        yield staging
+        files = sorted(staging.iterdir())
+        for file in files:
+            if (folder / file.name).is_dir():
+                raise InputError(
+                    f"{folder / file.name}: is a folder where a file goes: choose another --out."
+                )
+        if exists:
+            for file in files:
+                os.replace(file, folder / file.name)
+        else:
+            os.rename(staging, folder)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+# --- what the commands share
+
+_QUANTITIES = {"mass": ("mass", "t", 2), "time": ("time", "s", 1), "work": ("work", "kJ", 0)}
+_RECEIVER_FIELDS = ("x", "y", "heading")
+
+
+def _read_pile(name: str) -> tuple[Pile, dict[str, Any]]:
+    """A pile, and what plan.json says about it."""
+    from wlplan.io import bundled_pile_path, read_pile
+    from wlplan.pile import toe_contour
+
+    path = bundled_pile_path() if name == BUNDLED else Path(name)
+    pile = read_pile(path)
+    toe_contour(pile)  # a pile that cannot be dug is refused here
+    fields = {
+        "file": f"{BUNDLED} ({path.name})" if name == BUNDLED else name,
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "cells": list(pile.height.shape),
+        "cell_size": pile.cell_size,
+        "origin": [float(value) for value in pile.origin],
+    }
+    return pile, fields
+
+
+def _load_world(name: str, model: str | None) -> World:
+    from wlplan.worlds import load_world
+
+    return load_world(name) if model is None else load_world(name, model=model)
+
+
+def _receiver(pile: Pile, truck: tuple[float, ...] | None) -> Receiver:
+    """Where the loader dumps.
+
+    Args:
+        pile: The pile.
+        truck: x [m], y [m] and, if given, heading [degree]; None for the default place.
+
+    Raises:
+        InputError: If the place lies on the pile or far away from it.
+    """
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from wlplan.diggability import edge_poses
+    from wlplan.heightmap import sample
+    from wlplan.pile import ground_height, toe_contour
+    from wlplan.transport import Receiver, default_receiver, v_turn_length
+
+    if truck is None:
+        return default_receiver(pile)
+    x, y = truck[:2]
+    size = pile.cell_size * np.array(pile.height.shape)
+    low = np.asarray(pile.origin, float)
+    away = math.hypot(*(np.array([x, y]) - low - 0.5 * size))
+    if away > _FARTHEST_TRUCK:
+        raise InputError(
+            f"--truck {x:g},{y:g} lies {away:.0f} m from the middle of the map, which spans x "
+            f"{low[0]:.0f} to {low[0] + size[0]:.0f} and y {low[1]:.0f} to {low[1] + size[1]:.0f} "
+            f"m: give it in that frame (whole kilometres of survey coordinates are taken off)."
+        )
+    dtype = pile.height.dtype
+    above = pile.height - ground_height(pile)
+    place = [jnp.asarray(value, dtype) for value in (x, y)]
+    inside = bool(np.all((np.array([x, y]) >= low) & (np.array([x, y]) <= low + size)))
+    if inside and float(sample(above, pile, *place)) > 0.5:
+        raise InputError(f"--truck {x:g},{y:g} lies on the pile: give a place beside it.")
+    if len(truck) == 3:
+        heading = math.radians(truck[2])
+        heading = math.remainder(heading, 2.0 * math.pi)
+    else:
+        poses = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, dtype), edge_poses(toe_contour(pile), 24)
+        )
+        headings = np.radians(np.arange(-180.0, 180.0, 5.0))
+        lengths = jax.jit(
+            jax.vmap(
+                lambda h: jax.vmap(
+                    lambda pose: v_turn_length(pose, Receiver(*place, h))  # type: ignore[call-arg]
+                )(poses).mean()
+            )
+        )(jnp.asarray(headings, dtype))
+        heading = float(headings[int(np.argmin(lengths))])
+    return Receiver(*place, jnp.asarray(heading, dtype))  # type: ignore[call-arg]
+
+
+def _receiver_fields(receiver: Receiver) -> dict[str, float]:
+    return {name: float(getattr(receiver, name)) for name in _RECEIVER_FIELDS}
+
+
+def _ready(result: Any) -> Any:
+    """The result, once the device has computed it."""
+    import jax
+
+    return jax.block_until_ready(result)
+
+
+def _sum(values: Any) -> float:
+    import numpy as np
+
+    return float(np.asarray(values, np.float64).sum())
+
+
+def _totals(performance: Performance, cost: Any) -> dict[str, float]:
+    return {**{q: _sum(getattr(performance, q)) for q in _QUANTITIES}, "cost": float(cost)}
+
+
+def _ledger(pile: Pile, simulated: PlanResult, simulator: Any) -> dict[str, float]:
+    """What left the pile [m^3], and what was loaded [tonne], at a density [tonne/m^3]."""
+    import numpy as np
+
+    from wlplan.pile import ground_height
+    from wlplan.units import KG_PER_TONNE
+
+    def volume(after: Pile) -> float:
+        # In float64: a bucket is a small difference of large volumes.
+        above = np.asarray(after.height, np.float64) - np.asarray(ground_height(after), np.float64)
+        return float(above.sum()) * after.cell_size**2
+
+    return {
+        "volume_before": volume(pile),
+        "volume_after": volume(simulated.rollout.pile),
+        "mass_removed": _sum(simulated.rollout.performance.mass),
+        "density": simulator.soil.density / KG_PER_TONNE,
+    }
+
+
+def _remark_on_ledger(ledger: Mapping[str, float]) -> None:
+    from wlplan.report import LEDGER_TOLERANCE, ledger_error
+
+    error = ledger_error(ledger)
+    if error > LEDGER_TOLERANCE:
+        _remark(f"the ledger of the simulated pile is off by {100.0 * error:.2g} %")
+
+
+def _json_text(document: Mapping[str, Any]) -> str:
+    try:
+        return json.dumps(document, indent=2, allow_nan=False)
+    except ValueError as error:
+        raise InputError(
+            "the result holds numbers that are not finite: check the pile for spikes, or use "
+            "another world."
+        ) from error
+
+
+def _remark(text: str) -> None:
+    print(f"note: {text}", file=sys.stderr)
+
+
+def _print_plan(document: Mapping[str, Any]) -> None:
+    """The loads of a plan as a table on stdout, with sums, cost and ledger."""
+    total, ledger = document["total"], document["ledger"]
+    predicted = total.get("predicted", {})
+    table = _table(f"{len(document['loads'])} loads from {document['pile']['file']}")
+    table.add_column("load")
+    for title in ("x [m]", "y [m]", "heading [°]"):
+        table.add_column(title, justify="right")
+    for title, unit, _ in _QUANTITIES.values():
+        if predicted:
+            table.add_column(f"{title} [{unit}]\npredicted", justify="right", style="cyan")
+        table.add_column(f"{title} [{unit}]\nsimulated", justify="right", style="yellow")
+    table.add_column("transport\n[s]", justify="right")
+
+    def cells(record: Mapping[str, Any], transport: Mapping[str, float]) -> list[str]:
+        row = []
+        for q, (_, _, digits) in _QUANTITIES.items():
+            for part in ("predicted", "simulated") if predicted else ("simulated",):
+                row.append(f"{record[part][q]:.{digits}f}")
+        return [*row, f"{transport['time']:.1f}"]
+
+    for n, load in enumerate(document["loads"], start=1):
+        place = (f"{load['x']:.2f}", f"{load['y']:.2f}", f"{math.degrees(load['heading']):.0f}")
+        last = n == len(document["loads"])
+        table.add_row(str(n), *place, *cells(load, load["transport"]), end_section=last)
+    table.add_row("sum", "", "", "", *cells(total, total["transport"]), style="bold")
+    _print_table(table)
+
+    for q, (title, unit, _) in _QUANTITIES.items():
+        simulated = total["simulated"][q]
+        if predicted and simulated:
+            off = 100.0 * (predicted[q] / simulated - 1.0)
+            print(f"{title}: predicted {off:+.1f} % off the simulated {simulated:.1f} {unit}")
+    costs = [f"{part} {total[part]['cost']:.3f}" for part in total if "cost" in total[part]]
+    print(f"cost for {document['objective']}: {', '.join(costs)}")
+    lost = ledger["volume_before"] - ledger["volume_after"]
+    print(
+        f"ledger: {ledger['volume_before']:.2f} m³ before, {ledger['volume_after']:.2f} m³ after; "
+        f"{lost:.3f} m³ at {ledger['density']:.3f} t/m³ for {ledger['mass_removed']:.3f} t loaded"
+    )
+
+
+def _table(title: str) -> Any:
+    from rich import box
+    from rich.markup import escape
+    from rich.table import Table
+
+    return Table(title=escape(title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+
+
+def _print_table(table: Any) -> None:
+    from rich.console import Console
+
+    # A file or a pipe has no width of its own: take what the table needs.
+    Console(width=None if sys.stdout.isatty() else 140, highlight=False).print(table)
+
+
+# --- time
+
+
+class _Progress:
+    """`progress(stage, done, total, cost)` on stderr: bars on a terminal, now and then a line."""
+
+    def __init__(self) -> None:
+        self._bars: Any = None
+        self._tasks: dict[str, TaskID] = {}
+        self._told: dict[str, float] = {}
+
+    def __enter__(self) -> _Progress:
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import (
+                BarColumn,
+                MofNCompleteColumn,
+                Progress,
+                TextColumn,
+                TimeElapsedColumn,
+            )
+
+            self._bars = Progress(
+                TextColumn("{task.description:<12}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TextColumn("{task.fields[cost]}"),
+                console=Console(stderr=True),
+                transient=True,
+            )
+            self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+
+    def __call__(self, stage: str, done: int, total: int, cost: float | None) -> None:
+        text = "" if cost is None else f"cost {cost:.3f}"
+        if self._bars is not None:
+            if stage not in self._tasks:
+                self._tasks[stage] = self._bars.add_task(stage, total=total, cost=text)
+            self._bars.update(self._tasks[stage], completed=done, total=total, cost=text)
+            return
+        now = time.monotonic()
+        if stage in self._told and done < total and now - self._told[stage] < _PROGRESS_PAUSE:
+            return
+        self._told[stage] = now
+        print(f"{stage} {done}/{total} {text}".rstrip(), file=sys.stderr, flush=True)
+
+
+# Begin and end of everything that JAX has traced and compiled so far [s], of `time.perf_counter`.
+_compilations: list[tuple[float, float]] = []
+
+
+def _on_duration(event: str, seconds: float, **_: object) -> None:
+    if event.startswith("/jax/core/compile/"):
+        now = time.perf_counter()
+        _compilations.append((now - seconds, now))
+
+
+class _Stopwatch:
+    """Wall-clock time of a block, tracing and compiling apart from the rest."""
+
+    _listens = False
+
+    def __enter__(self) -> _Stopwatch:
+        import jax
+
+        if not _Stopwatch._listens:
+            jax.monitoring.register_event_duration_secs_listener(_on_duration)
+            _Stopwatch._listens = True
+        self._first, self._begin = len(_compilations), time.perf_counter()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds = time.perf_counter() - self._begin
+        # Stages nest: one second of compiling inside of tracing counts once.
+        self.compiling, reached = 0.0, self._begin
+        for begin, end in sorted(_compilations[self._first :]):
+            self.compiling += max(end - max(begin, reached), 0.0)
+            reached = max(reached, end)
+
+    def text(self) -> str:
+        """Both times, for people."""
+        running = max(self.seconds - self.compiling, 0.0)
+        return f"{self.seconds:.1f} s ({self.compiling:.1f} s compiling, {running:.1f} s running)"

@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import errno
+import functools
 import hashlib
 import importlib.metadata
 import itertools
@@ -25,7 +26,6 @@ import shutil
 import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any, no_type_check
 
@@ -339,7 +339,8 @@ class _Group:
         height = np.asarray(self.height)
         valid = np.zeros(len(self.rollouts), bool)
         for k, rollout in enumerate(self.rollouts):
-            pose = self._choose(height[k], rollout, load)
+            pile = Pile(jnp.asarray(height[k]), CELL_SIZE, jnp.asarray(self.origin))
+            pose = choose_pose(pile, rollout.place[load], rollout.turn[load])
             valid[k] = pose is not None
             # A pile that is used up is dug where it was dug last; `valid` tells.
             self.pose[k] = self.pose[k] if pose is None else pose
@@ -360,20 +361,6 @@ class _Group:
             }
         )
 
-    def _choose(
-        self, height: Float[np.ndarray, "nx ny"], rollout: _Rollout, load: int
-    ) -> Float[np.ndarray, "3"] | None:
-        """A random dig pose at the toe of the pile as it is; None if nothing is left to dig."""
-        try:
-            toe = toe_contour(Pile(jnp.asarray(height), CELL_SIZE, jnp.asarray(self.origin)))
-        except InputError:
-            return None
-        candidates = np.flatnonzero(toe.accessible)
-        if candidates.size == 0:
-            return None
-        at = candidates[int(rollout.place[load] * candidates.size)]
-        return np.array([*toe.points[at], toe.heading[at] + rollout.turn[load]], np.float32)
-
     def records(self) -> dict[str, np.ndarray]:
         """The variables of all loadings, a rollout after the other."""
         count = len(self.rollouts)
@@ -382,6 +369,28 @@ class _Group:
             column = np.stack([np.asarray(load[name])[:count] for load in self.loads], axis=1)
             result[name] = column.reshape(-1, *variable.shape).astype(variable.dtype)
         return result
+
+
+def choose_pose(pile: Pile, place: float, turn: float) -> Float[np.ndarray, "3"] | None:
+    """A dig pose at the toe of a pile as it is: x, y [m] and heading [rad].
+
+    Args:
+        pile: One pile.
+        place: Which of the accessible points of the toe, 0 to 1 along it.
+        turn: Heading over the normal into the pile [rad].
+
+    Returns:
+        The pose; None if there is nothing left to dig.
+    """
+    try:
+        toe = toe_contour(pile)
+    except InputError:
+        return None
+    candidates = np.flatnonzero(toe.accessible)
+    if candidates.size == 0:
+        return None
+    at = candidates[min(int(place * candidates.size), candidates.size - 1)]
+    return np.array([*toe.points[at], toe.heading[at] + turn], np.float32)
 
 
 @jax.jit
@@ -429,9 +438,10 @@ def latin_hypercube(
     return (slices + random.random(slices.shape)) / points
 
 
+@functools.cache
 def _grid_shape() -> tuple[int, int]:
     """The smallest grid that holds each of the seed piles [cells]."""
-    shapes = [seed_pile(kind, slope=slope).height.shape for kind, slope in SEED_PILES]
+    shapes = [seed_pile(kind, slope=slope, noise=0.0).height.shape for kind, slope in SEED_PILES]
     nx, ny = np.max(shapes, axis=0)
     return int(nx), int(ny)
 
@@ -447,9 +457,10 @@ def _on_grid(pile: Pile, shape: tuple[int, int]) -> Pile:
     )
 
 
+@functools.cache
 def _relaxer(repose_angle: float) -> Callable[[Pile], Pile]:
     # One pile at a time, since `relax` stops as soon as the pile stands.
-    return jax.jit(partial(relax, repose_angle=repose_angle))
+    return jax.jit(functools.partial(relax, repose_angle=repose_angle))
 
 
 # --- storing
@@ -750,9 +761,9 @@ class Normaliser:
         """The normaliser of a table; a component that never changes is only shifted."""
         low = values.min(axis=0)
         span = values.max(axis=0) - low
-        return cls(low, np.where(span > 0.0, span, np.ones_like(span)))
+        return cls(jnp.asarray(low), jnp.asarray(np.where(span > 0.0, span, np.ones_like(span))))
 
-    def normalise(self, values: Float[Array | np.ndarray, "*n k"]) -> Float[Array, "*n k"]:
+    def normalise(self, values: Float[Array, "*n k"]) -> Float[Array, "*n k"]:
         """Values in units of the range; outside it they go on linearly."""
         return (values - self.low) / self.span
 

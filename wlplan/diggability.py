@@ -107,8 +107,6 @@ def edge_poses(contour: ToeContour, locations: int) -> Pose:
     )
 
 
-def _turn(
-    start: Float[np.ndarray, " n"], end: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
+def _turn(start: Float[np.ndarray, " n"], end: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Angle from one heading to another [rad], -pi to pi."""
     return (end - start + math.pi) % (2.0 * math.pi) - math.pi

@@ -452,7 +452,11 @@ def _draw_digs(
 ) -> None:
     panel.add_collection(
         LineCollection(
-            list(np.stack([labels, digs], axis=1)), colors=_BLUE, linewidths=0.7, alpha=0.8, zorder=5
+            list(np.stack([labels, digs], axis=1)),
+            colors=_BLUE,
+            linewidths=0.7,
+            alpha=0.8,
+            zorder=5,
         )
     )
     reach = 3.4 * radius
@@ -474,7 +478,9 @@ def _draw_digs(
             )
         )
         panel.add_patch(
-            Circle(tuple(label), radius, facecolor=_BLUE, edgecolor="white", linewidth=0.8, zorder=8)
+            Circle(
+                tuple(label), radius, facecolor=_BLUE, edgecolor="white", linewidth=0.8, zorder=8
+            )
         )
         panel.text(
             *label,

@@ -42,7 +42,11 @@ li { margin: .3rem 0; }
 @media print { body { max-width: none; padding: 0; } .card, figure, tr { break-inside: avoid; } }
 """
 
-_QUANTITIES = (("mass", "Mass", "t", 2), ("time", "Loading time", "s", 1), ("work", "Work", "kJ", 0))
+_QUANTITIES = (
+    ("mass", "Mass", "t", 2),
+    ("time", "Loading time", "s", 1),
+    ("work", "Work", "kJ", 0),
+)
 
 # Relative error above which a ledger does not count as closed.
 LEDGER_TOLERANCE = 1e-4
@@ -83,7 +87,9 @@ def render_report(
     """The report as HTML; arguments as for `write_report`. Every text is escaped."""
     pile = document.get("pile", {})
     count = len(document["loads"])
-    title = f"Loading plan: {count} load{'s' if count != 1 else ''} from {pile.get('file', 'a pile')}"
+    title = (
+        f"Loading plan: {count} load{'s' if count != 1 else ''} from {pile.get('file', 'a pile')}"
+    )
     parts = [
         f"<h1>{_text(title)}</h1>",
         f'<p class="sub">planned by {_text(document.get("planner", "an unnamed planner"))} in the '

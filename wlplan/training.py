@@ -171,7 +171,7 @@ def train_psi_low(
         raise InputError("The data set holds numbers that are not finite: collect it again.")
     inputs, outputs = (Normaliser.of(values) for values in tables[0])
     (x, y), (x_val, y_val), _ = [
-        (jnp.asarray(inputs.normalise(a)), jnp.asarray(outputs.normalise(b))) for a, b in tables
+        (inputs.normalise(jnp.asarray(a)), outputs.normalise(jnp.asarray(b))) for a, b in tables
     ]
 
     network = PsiLow(hidden, activation=activation, dropout=dropout, rngs=nnx.Rngs(seed))
@@ -338,6 +338,9 @@ def save_model(
             beside.mkdir()
             with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
                 checkpointer.save(beside / _WEIGHTS, args=ocp.args.PyTreeSave(weights))
+            # Names the directory it was made in, and nothing reads it on a file system that
+            # renames in one step.
+            (beside / _WEIGHTS / "commit_success.txt").unlink(missing_ok=True)
             description = {
                 "format": MODEL_FORMAT,
                 "kind": "psi_low",

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from wlplan.objective import Objective, loading_cost
 from wlplan.planner.toe import Toe, pose_at
-from wlplan.rollout import closed_loop
+from wlplan.horizon import closed_loop
 from wlplan.transport import Receiver, transport
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose, Rollout, World, action_from
 from wlplan.units import ACTION_HIGH, ACTION_LOW
