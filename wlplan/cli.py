@@ -327,6 +327,7 @@ def plan(
         planner=planner,
         objective=objective,
         seed=seed,
+        **({} if model is None else {"model": model}),
         receiver=_receiver_fields(receiver),
         total={
             "predicted": _totals(planned.rollout.performance, planned.cost),
@@ -414,11 +415,8 @@ def simulate(
 
     loading_plan, given = read_plan(plan_file)
     pile, source = _read_pile(pile_file)
-    hashes = [
-        (record if isinstance(record, dict) else {}).get("sha256")
-        for record in (given.get("pile"), source)
-    ]
-    if None not in hashes and hashes[0] != hashes[1]:
+    made_for = given.get("pile")
+    if isinstance(made_for, dict) and made_for.get("sha256", source["sha256"]) != source["sha256"]:
         _remark("the plan was made for another pile file than this one")
     objective = given.get("objective")
     objective = objective if objective in OBJECTIVES else OBJECTIVES[0]
@@ -442,7 +440,7 @@ def simulate(
         simulated=played.rollout.performance,
         transport={"time": played.transport_time, "work": played.transport_work},
         pile=source,
-        **{name: given[name] for name in ("world", "planner", "seed") if name in given},
+        **{name: given[name] for name in _ORIGIN_FIELDS if name in given},
         objective=objective,
         receiver=_receiver_fields(receiver),
         total=total,
@@ -541,9 +539,10 @@ def diggability(
 
     pile, source = _read_pile(pile_file)
     world = _load_world(world_name, model)
+    fixed = Action(*action)  # type: ignore[arg-type]
     with _Progress() as progress, _Stopwatch() as mapping:
         progress("diggability", 0, 1, None)
-        found = _ready(diggability_map(world, pile, locations=locations, action=Action(*action)))
+        found = _ready(diggability_map(world, pile, locations=locations, action=fixed))
         progress("diggability", 1, 1, None)
 
     records = {
@@ -807,6 +806,8 @@ def _staged(folder: Path) -> Iterator[Path]:
 
 _QUANTITIES = {"mass": ("mass", "t", 2), "time": ("time", "s", 1), "work": ("work", "kJ", 0)}
 _RECEIVER_FIELDS = ("x", "y", "heading")
+# What a plan says about where it comes from; playing it again keeps that.
+_ORIGIN_FIELDS = ("world", "model", "planner", "seed")
 
 
 def _read_pile(name: str) -> tuple[Pile, dict[str, Any]]:
@@ -984,7 +985,10 @@ def _print_plan(document: Mapping[str, Any]) -> None:
         simulated = total["simulated"][q]
         if predicted and simulated:
             off = 100.0 * (predicted[q] / simulated - 1.0)
-            print(f"{title}: predicted {off:+.1f} % off the simulated {simulated:.1f} {unit}")
+            print(
+                f"{title}: predicted {predicted[q]:.1f} {unit}, simulated {simulated:.1f} {unit}, "
+                f"difference {off:+.1f} %"
+            )
     costs = [f"{part} {total[part]['cost']:.3f}" for part in total if "cost" in total[part]]
     print(f"cost for {document['objective']}: {', '.join(costs)}")
     lost = ledger["volume_before"] - ledger["volume_after"]
@@ -1065,10 +1069,10 @@ class _Progress:
 _compilations: list[tuple[float, float]] = []
 
 
-def _on_duration(event: str, seconds: float, **_: object) -> None:
+def _on_duration(event: str, duration_secs: float, **_: str | int) -> None:
     if event.startswith("/jax/core/compile/"):
         now = time.perf_counter()
-        _compilations.append((now - seconds, now))
+        _compilations.append((now - duration_secs, now))
 
 
 class _Stopwatch:

@@ -25,6 +25,7 @@ import shlex
 import shutil
 import socket
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, no_type_check
@@ -520,6 +521,11 @@ def _create(path: Path, layout: _Layout, identity: Mapping[str, Any]) -> None:
                     **variable.attributes,
                 },
             )
+        # A copy of all metadata in the group's own: xarray looks for it and complains without. That
+        # is a convention, not yet part of the format, says the warning.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            zarr.consolidate_metadata(str(beside), zarr_format=3)
         os.replace(beside, path)
     except BaseException:
         shutil.rmtree(beside, ignore_errors=True)
@@ -656,11 +662,13 @@ def _is_alive(holder: str) -> bool:
 
 
 def _start_of(pid: int) -> str:
-    """When a process started, where the system tells (Linux); else empty."""
+    """When a process started, or that it has ended, where the system tells (Linux); else "?"."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        # A process that was killed may stay listed until its parent asks for it.
+        return "ended" if fields[0] in "ZX" else fields[19]
     except (OSError, IndexError):
-        return ""
+        return "?"
 
 
 # --- reading
@@ -763,10 +771,10 @@ class Normaliser:
         span = values.max(axis=0) - low
         return cls(jnp.asarray(low), jnp.asarray(np.where(span > 0.0, span, np.ones_like(span))))
 
-    def normalise(self, values: Float[Array, "*n k"]) -> Float[Array, "*n k"]:
-        """Values in units of the range; outside it they go on linearly."""
+    def normalise(self, values: Float[Array, " k"]) -> Float[Array, " k"]:
+        """One vector in units of the range; outside it the units go on linearly."""
         return (values - self.low) / self.span
 
-    def denormalise(self, values: Float[Array, "*n k"]) -> Float[Array, "*n k"]:
+    def denormalise(self, values: Float[Array, " k"]) -> Float[Array, " k"]:
         """The inverse of `normalise`."""
         return self.low + values * self.span

@@ -17,7 +17,7 @@ from wlplan.pile import ToeContour, toe_contour
 from wlplan.types import Action, Performance, Pile, Pose, PyTree, World
 
 # The action of the paper's diggability map. Paper, section 6.4.
-PAPER_ACTION = Action(0.68, 4.51, 0.17, 4.46)
+PAPER_ACTION = Action(0.68, 4.51, 0.17, 4.46)  # type: ignore[arg-type]
 
 
 @no_type_check
@@ -101,8 +101,8 @@ def edge_poses(contour: ToeContour, locations: int) -> Pose:
     # Between two points of an open contour's ends, or of a cusp, the headings may cancel.
     smooth = np.abs(_turn(contour.heading[nearest], contour.heading[neighbour])) < 0.5 * math.pi
     return Pose(
-        x=between(contour.points[:, 0]),
-        y=between(contour.points[:, 1]),
+        x=between(contour.points[:, 0]),  # type: ignore[arg-type]
+        y=between(contour.points[:, 1]),  # type: ignore[arg-type]
         heading=np.where(smooth, heading, contour.heading[nearest]),
     )
 

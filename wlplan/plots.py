@@ -10,17 +10,15 @@ import dataclasses
 import io
 import math
 import os
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
-from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, FancyArrowPatch, Polygon
 
@@ -51,6 +49,8 @@ _MARGIN = 2.0
 _TRUCK_REACH = 0.75
 # Body of the truck that is drawn [m]: length and width of a small hauler. Only a symbol.
 _TRUCK_SIZE = (7.0, 2.6)
+# Width of one map on paper [inch].
+_PANEL_WIDTH = 5.6
 # Radius of the numbers of the digs, as a part of the longer side of the view.
 _LABEL_PART = 0.02
 # Length of the line that marks a location of a diggability map [m]; at most this part of the view.
@@ -85,7 +85,7 @@ def plan_figure(
     truck = None if receiver is None else _Truck(receiver)
     seen = digs
     if truck is not None and truck.is_near(view):
-        seen = np.concatenate([digs, truck.body, truck.way])
+        seen = np.concatenate([digs, truck.body, truck.way - truck.ahead])
     # Labels are as large as the map allows, and the map widens to hold them.
     radius = _LABEL_PART * float(np.ptp(_view(before, seen), axis=0).max())
     labels = _label_places(digs, heading, radius, before)
@@ -110,7 +110,7 @@ def plan_figure(
         ScalarMappable(norm, _PILE), cax=panels[1].inset_axes((1.03, 0.0, 0.035, 1.0))
     )
     bar.set_label("height above the ground [m]")
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     _legend(figure, before)
     return figure
 
@@ -460,8 +460,9 @@ def _draw_digs(
         )
     )
     reach = 3.4 * radius
-    # Points a data unit: the arrow heads and numbers grow with the map.
-    scale = 72.0 * _points_per_metre(panel)
+    # The numbers fit their circles: a point is 1/72 inch.
+    low, high = panel.get_xlim()
+    points_per_metre = 72.0 * _PANEL_WIDTH / (high - low)
     for number, (dig, towards, label) in enumerate(zip(digs, heading, labels, strict=True), 1):
         tip = dig + reach * np.array([math.cos(towards), math.sin(towards)])
         panel.add_patch(
@@ -483,10 +484,11 @@ def _draw_digs(
             )
         )
         panel.text(
-            *label,
+            label[0],
+            label[1],
             str(number),
             color="white",
-            fontsize=min(9.0, radius * scale * (1.05 if number < 100 else 0.8)),
+            fontsize=min(9.0, radius * points_per_metre * (1.0 if number < 100 else 0.75)),
             fontweight="bold",
             ha="center",
             va="center_baseline",
@@ -495,12 +497,6 @@ def _draw_digs(
     panel.plot(
         *digs.T, "o", color=_BLUE, markersize=4.0, markeredgecolor="white", mew=0.6, zorder=7
     )
-
-
-def _points_per_metre(panel: Axes) -> float:
-    """Inches on paper a metre of the map, before the layout is final."""
-    low, high = panel.get_xlim()
-    return panel.get_position().width * panel.figure.get_figwidth() / (high - low)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -607,8 +603,7 @@ def _figure(width: float, height: float) -> Figure:
 def _maps(view: Float[np.ndarray, "2 2"], count: int) -> tuple[Figure, list[Axes]]:
     """A row of panels that fit a view."""
     size = np.ptp(view, axis=0)
-    width = 5.6
-    figure = _figure(count * width + 1.0, width * float(size[1] / size[0]) + 1.0)
+    figure = _figure(count * _PANEL_WIDTH + 1.0, _PANEL_WIDTH * float(size[1] / size[0]) + 1.0)
     return figure, list(np.atleast_1d(figure.subplots(1, count)))
 
 

@@ -138,13 +138,20 @@ _NOTES = """<ul>
 loader of the WA320 class in dry gravel. It is not a measurement on a machine.</li>
 <li>The transport is an estimate from the length of a V-turn at constant speed. Obstacles, the
 pile among them, are not looked at: check that the way to the truck is free.</li>
-<li>Cells that the scan did not see are filled in from their surroundings. No dig starts there, but
-a load may reach into them.</li>
+<li>Cells that the scan did not see, hatched in the maps, are filled in from their surroundings: a
+load that reaches into them rests on a guess.</li>
 </ul>"""
 
 
 def _text(value: object) -> str:
     return html.escape(str(value))
+
+
+def _plain(value: object) -> str:
+    """A value of plan.json, lists without brackets and numbers without noise."""
+    if isinstance(value, list | tuple):
+        return ", ".join(_plain(part) for part in value)
+    return _text(f"{value:.6g}" if isinstance(value, float) else value)
 
 
 def _number(value: object, digits: int = 2) -> str:
@@ -272,14 +279,14 @@ def _settings(document: Mapping[str, Any], more: Mapping[str, str]) -> str:
     pile, receiver = document.get("pile", {}), document.get("receiver", {})
     rows = [
         (name, _text(document[name]))
-        for name in ("world", "planner", "objective", "seed")
+        for name in ("world", "model", "planner", "objective", "seed")
         if name in document
     ]
     if receiver:
         place = f"x {_number(receiver.get('x'))} m, y {_number(receiver.get('y'))} m"
         heading = _number(math.degrees(receiver.get("heading", math.nan)), 0)
         rows.append(("where the loader dumps", f"{place}, heading {heading}°"))
-    rows += [(f"pile, {name}", _text(value)) for name, value in pile.items()]
+    rows += [(f"pile, {_text(name)}", _plain(value)) for name, value in pile.items()]
     rows += [(_text(name), _text(value)) for name, value in more.items()]
     return _facts(rows)
 

@@ -171,7 +171,8 @@ def train_psi_low(
         raise InputError("The data set holds numbers that are not finite: collect it again.")
     inputs, outputs = (Normaliser.of(values) for values in tables[0])
     (x, y), (x_val, y_val), _ = [
-        (inputs.normalise(jnp.asarray(a)), outputs.normalise(jnp.asarray(b))) for a, b in tables
+        (jax.vmap(inputs.normalise)(jnp.asarray(a)), jax.vmap(outputs.normalise)(jnp.asarray(b)))
+        for a, b in tables
     ]
 
     network = PsiLow(hidden, activation=activation, dropout=dropout, rngs=nnx.Rngs(seed))

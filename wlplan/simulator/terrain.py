@@ -30,6 +30,8 @@ _AHEAD, _SLOPE_LENGTH = 0.2, 0.8
 # Rake angles and slopes for which the failure wedge makes sense [rad].
 _LEAST_RAKE, _GREATEST_RAKE = math.radians(12.0), math.radians(80.0)
 _LEAST_SLOPE, _GREATEST_SLOPE = math.radians(-10.0), math.radians(35.0)
+# Time that one sweep of the automaton stands for during the dig [s], and so the longest step.
+_SLIDE_TIME = 0.02
 # Soil pushed out of the bucket is laid down over this distance ahead of the edge [m].
 _PUSH_LENGTH = 0.7
 
@@ -137,7 +139,7 @@ def move(
         ground: Floor under the pile [m]; nothing is cut below it.
         bucket: Pose of the bucket after the step.
         reach: Furthest position of the cutting edge before and after the step [m].
-        step: Time step [s].
+        step: Time step, at most 0.02 [s].
     """
     dtype = height.dtype
     along = jnp.asarray(_ALONG, dtype)
@@ -170,14 +172,17 @@ def move(
     )
     occupied = inside[:, None] * lane
     surface = height + occupied * (jnp.maximum(level[None, :], height) - height)
-    largest = soil.slide_rate * step / (FLOW_FRACTION * CELL_SIZE)
-    change = sweep(surface, CELL_SIZE * math.tan(soil.friction), largest=largest) - surface
+    # A whole sweep stands for _SLIDE_TIME, a shorter step for its share of one.
+    share = step / _SLIDE_TIME
+    largest = soil.slide_rate * _SLIDE_TIME / (FLOW_FRACTION * CELL_SIZE)
+    slid = sweep(surface, CELL_SIZE * math.tan(soil.friction), largest=largest)
+    change = share * (slid - surface)
     into_bucket = occupied * open_part[None, :] * jnp.maximum(change, 0.0)
     height = height + change - into_bucket
     fill = fill + into_bucket.sum(0) * _CELL_AREA
 
     # Inside the bucket the lanes level out at the angle of repose, like the terrain.
-    return height, fill - _lane_outflow(fill, width, machine, soil)
+    return height, fill - share * _lane_outflow(fill, width, machine, soil)
 
 
 def _lane_outflow(fill: Array, width: Array, machine: WheelLoader, soil: Soil) -> Array:

@@ -1,0 +1,375 @@
+"""Laws of the collection: what is stored, resuming, splits, and what bad stores are told."""
+
+import dataclasses
+import errno
+import json
+import math
+import os
+import shutil
+import socket
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from wlplan import dataset as module
+from wlplan.dataset import (
+    VARIABLES,
+    Dataset,
+    Normaliser,
+    choose_pose,
+    collect,
+    fingerprint,
+    latin_hypercube,
+    open_dataset,
+    reflect,
+    split,
+)
+from wlplan.errors import InputError
+from wlplan.heightmap import sample_local
+from wlplan.machine import GRAVEL
+from wlplan.pile import SEED_PILES, seed_pile
+from wlplan.simulator import STOP_REASONS, Simulator
+from wlplan.types import Pile, Pose
+from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE
+
+CYCLES, SEED = 11, 5
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _short_rollouts():
+    """Rollouts of 3 loadings, one a group, two a batch: 11 cycles are four rollouts, two batches."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "LOADS", 3)
+        patch.setattr(module, "_GROUP", 1)
+        patch.setattr(module, "_GROUPS", 2)
+        yield
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    path = tmp_path_factory.mktemp("dataset") / "data.zarr"
+    seen = []
+    collect(path, cycles=CYCLES, seed=SEED, progress=lambda done, total: seen.append((done, total)))
+    assert seen[0] == (0, CYCLES)
+    assert seen[-1] == (CYCLES, CYCLES)
+    assert seen == sorted(seen)
+    return path
+
+
+@pytest.fixture(scope="module")
+def data(store):
+    return open_dataset(store)
+
+
+@pytest.fixture
+def copy(store, tmp_path):
+    return shutil.copytree(store, tmp_path / "copy.zarr")
+
+
+def contents(path):
+    """Every file of a store by name."""
+    return {p.relative_to(path): p.read_bytes() for p in path.rglob("*") if p.is_file()}
+
+
+def numbered(rollouts, loads=3):
+    """A data set of zeros, but for the number of the rollout."""
+    n = rollouts * loads
+    columns = {name: np.zeros((n, *v.shape), v.dtype) for name, v in VARIABLES.items()}
+    columns["rollout"] = np.repeat(np.arange(rollouts, dtype=np.int32), loads)
+    return Dataset(**columns, attributes={})
+
+
+def refused(call, *words):
+    with pytest.raises(InputError) as error:
+        call()
+    message = str(error.value)
+    assert "\n" not in message
+    assert len(message) > 20
+    for word in words:
+        assert word in message
+
+
+# --- what is stored
+
+
+def test_every_cycle_is_there_and_in_order(data):
+    assert len(data) == CYCLES
+    assert data.rollout.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3]
+    assert data.load.tolist() == [0, 1, 2] * 3 + [0, 1]
+    np.testing.assert_array_equal(data.seed_pile, data.rollout % len(SEED_PILES))
+    assert data.valid.all()
+
+
+def test_the_outcomes_are_those_of_loading_cycles(data):
+    for name in ("mass", "time", "work", "fill_time"):
+        assert np.all(getattr(data, name) > 0.0)
+    assert np.all(data.mass < 6.0)
+    assert np.all(data.fill_time < data.time)
+    assert np.all((data.work_slip >= 0.0) & (data.work_slip < data.work))
+    assert np.all((data.stop_reason >= 0) & (data.stop_reason < len(STOP_REASONS)))
+    assert all(np.isfinite(getattr(data, name)).all() for name in VARIABLES)
+
+
+def test_the_actions_fill_their_box(data):
+    assert np.all((data.action >= ACTION_LOW) & (data.action <= ACTION_HIGH))
+    # One hypercube over the 6 x 3 loadings of a set: no two cycles share a slice.
+    slices = np.floor(data.action / ACTION_HIGH * len(SEED_PILES) * 3)
+    assert all(len(np.unique(column)) == CYCLES for column in slices.T)
+
+
+def test_the_maps_begin_at_the_reference_and_the_change_is_local(data):
+    # The centre line lies between two columns.
+    assert np.all(np.abs(data.h36[:, 0, 17:19].mean(axis=1)) < 0.05)
+    assert np.all(np.abs(data.h52[:, 0, 25:27]) < 0.05)
+    moved = data.h52_after != data.h52
+    assert 0.02 < moved.mean() < 0.9
+    assert np.abs(data.h52_after - data.h52).max() < 1.5
+
+
+def test_the_volume_that_the_map_loses_is_about_the_load(data):
+    lost = (data.h52 - data.h52_after).sum(axis=(1, 2)) * CELL_SIZE**2 * GRAVEL.density / 1000.0
+    # Soil slides into the map from above it, so a part of the load shows outside.
+    assert np.all(lost < 1.05 * data.mass + 0.1)
+    assert np.median(lost / data.mass) > 0.7
+
+
+def test_what_left_the_grid_is_the_load():
+    pile = seed_pile("conical", slope=math.radians(30.0), seed=1)
+    shape = module._grid_shape()
+    pile = module._on_grid(pile, shape)
+    pose, action = choose_pose(pile, 0.3, 0.05), np.array([0.3, 3.0, 0.2, 3.0], np.float32)
+    origin = np.asarray(pile.origin)
+    after, record = module._play(
+        Simulator(), origin, np.asarray(pile.height)[None], pose[None], action[None]
+    )
+    lost = np.sum(np.asarray(pile.height - after[0], np.float64)) * CELL_SIZE**2
+    assert lost * GRAVEL.density / 1000.0 == pytest.approx(float(record["mass"][0]), rel=1e-3)
+    # The map after is the sampled pile after, over the reference of the map before.
+    dug = Pile(after[0], CELL_SIZE, origin)
+    where = Pose(*(jnp.asarray(value) for value in pose))
+    want = sample_local(dug, where, cells=52, displacement=1.0).height
+    got = np.asarray(record["h52_after"][0])
+    offset = (got - want)[:4, :4].mean()  # at the level ground behind the dig location
+    np.testing.assert_allclose(got - offset, want, atol=1e-4)
+
+
+def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike():
+    first, again, other = (module._Rollout(3, seed) for seed in (0, 0, 1))
+    assert first.noise_seed == again.noise_seed != other.noise_seed
+    np.testing.assert_array_equal(first.action, again.action)
+    assert not np.any(first.place == other.place)
+    headings = np.concatenate([module._Rollout(n, 0).turn for n in range(60)])
+    assert np.abs(headings).max() <= math.radians(10.0)
+    assert headings.std() == pytest.approx(math.radians(20.0) / math.sqrt(12.0), rel=0.1)
+
+
+@pytest.mark.parametrize("cycles", [1, 2, 3, 30, 31, 47, 449, 451, 1801, 10_718, 10_800])
+def test_the_batches_make_up_the_cycles(cycles, monkeypatch):
+    monkeypatch.undo()
+    layout = module._Layout(cycles)
+    assert layout.rollouts * module.LOADS >= cycles > (layout.rollouts - 1) * module.LOADS
+    assert 1 <= layout.group <= max(module._GROUP, 1)
+    # A batch starts with a rollout, and with a chunk.
+    assert layout.batch_cycles == cycles or layout.batch_cycles % module.LOADS == 0
+
+
+def test_a_hypercube_has_one_point_in_each_slice():
+    points = latin_hypercube(50, 4, np.random.default_rng(0))
+    assert points.shape == (50, 4)
+    for column in points.T:
+        assert sorted(np.floor(50 * column)) == list(range(50))
+    # Rows of a Latin hypercube are not sorted along with one another.
+    assert np.abs(np.corrcoef(points.T) - np.eye(4)).max() < 0.5
+
+
+def test_nothing_is_chosen_where_nothing_is_left():
+    flat = Pile(jnp.zeros((60, 60)), CELL_SIZE, jnp.zeros(2))
+    assert choose_pose(flat, 0.5, 0.0) is None
+
+
+@pytest.mark.parametrize("place", [0.0, 0.5, 1.0])
+def test_a_pose_heads_into_the_pile(place):
+    pile = seed_pile("conical", slope=math.radians(30.0), noise=0.0)
+    x, y, heading = choose_pose(pile, place, 0.1)
+    inward = math.atan2(-y, -x)
+    assert abs((heading - inward + math.pi) % (2.0 * math.pi) - math.pi) == pytest.approx(
+        0.1, abs=0.05
+    )
+
+
+def test_the_store_says_what_it_holds(store):
+    document = json.loads((store / "zarr.json").read_text())
+    attributes = document["attributes"]
+    assert attributes["format"] == "wlplan.dataset/1"
+    assert (attributes["cycles"], attributes["cycles_done"]) == (CYCLES, CYCLES)
+    assert attributes["seed"] == SEED
+    assert attributes["soil"] == dataclasses.asdict(GRAVEL)
+    assert set(attributes["versions"]) == {"wlplan", "jax", "numpy"}
+    for name, variable in VARIABLES.items():
+        array = json.loads((store / name / "zarr.json").read_text())
+        assert array["zarr_format"] == 3
+        assert array["dimension_names"] == ["cycle", *variable.dims]
+        assert array["attributes"]["units"] == variable.units
+        assert array["attributes"]["long_name"]
+    assert not store.with_name("data.zarr.lock").exists()
+
+
+# --- going on
+
+
+@pytest.mark.parametrize("after", [0, 4, 6, 9])
+def test_a_collection_that_was_cut_short_ends_with_the_same_bytes(store, tmp_path, after):
+    path = tmp_path / "data.zarr"
+
+    def stop(done, total):
+        if done >= after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collect(path, cycles=CYCLES, seed=SEED, progress=stop)
+    refused(lambda: open_dataset(path), f"of {CYCLES} cycles", "again")
+    collect(path, cycles=CYCLES, seed=SEED)
+    assert contents(path) == contents(store)
+
+
+def test_a_batch_that_was_half_written_is_written_again(store, copy):
+    module._update_attributes(copy, {"cycles_done": 6})
+    chunk = copy / "h52" / "c" / "1" / "0" / "0"
+    chunk.write_bytes(chunk.read_bytes()[:100])
+    (copy / "mass" / "c" / "1").unlink()
+    (copy / "mass" / "c" / "1.abc.partial").write_bytes(b"half")
+    collect(copy, cycles=CYCLES, seed=SEED)
+    assert contents(copy) == contents(store)
+
+
+def test_a_complete_collection_is_left_alone(copy):
+    before = contents(copy)
+    collect(copy, cycles=CYCLES, seed=SEED)
+    assert contents(copy) == before
+
+
+@pytest.mark.parametrize(
+    ("changed", "word"),
+    [
+        ({"seed": 6}, "seed"),
+        ({"cycles": 12}, "cycles"),
+        (
+            {"simulator": Simulator(soil=dataclasses.replace(GRAVEL, density=1500.0))},
+            "soil (density) 1727",
+        ),
+    ],
+)
+def test_another_collection_does_not_go_on_in_the_same_place(copy, changed, word):
+    before = contents(copy)
+    refused(lambda: collect(copy, **{"cycles": CYCLES, "seed": SEED, **changed}), word)
+    assert contents(copy) == before
+
+
+def test_two_processes_do_not_write_the_same_store(copy):
+    lock = copy.with_name("copy.zarr.lock")
+    lock.write_text(f"{os.getpid()} {module._start_of(os.getpid())} {socket.gethostname()}")
+    refused(lambda: collect(copy, cycles=CYCLES, seed=SEED), str(os.getpid()), lock.name)
+    assert lock.exists()
+
+
+@pytest.mark.parametrize("holder", ["", "99999999 1 {host}", "{pid} 1 {host}", "nonsense"])
+def test_the_lock_of_a_dead_process_is_taken_over(copy, holder):
+    lock = copy.with_name("copy.zarr.lock")
+    lock.write_text(holder.format(pid=os.getpid(), host=socket.gethostname()))
+    collect(copy, cycles=CYCLES, seed=SEED)
+    assert not lock.exists()
+
+
+def test_a_full_disk_is_said_in_one_line_and_costs_nothing(store, tmp_path, monkeypatch):
+    path = tmp_path / "data.zarr"
+    write = module._write
+
+    def fails(path, batch, start):
+        if start > 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, batch, start)
+
+    monkeypatch.setattr(module, "_write", fails)
+    refused(lambda: collect(path, cycles=CYCLES, seed=SEED), "No space", "first 6 of 11")
+    monkeypatch.setattr(module, "_write", write)
+    collect(path, cycles=CYCLES, seed=SEED)
+    assert contents(path) == contents(store)
+
+
+def test_other_things_are_not_overwritten(tmp_path):
+    (tmp_path / "note.txt").write_text("keep me")
+    refused(lambda: collect(tmp_path, cycles=3), "not a data set")
+    refused(lambda: collect(tmp_path / "note.txt", cycles=3), "not a data set")
+    refused(lambda: collect(tmp_path / "missing" / "data.zarr", cycles=3), "No such file")
+    refused(lambda: collect(tmp_path / "data.zarr", cycles=0), "at least 1")
+    assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+    assert (tmp_path / "note.txt").read_text() == "keep me"
+
+
+# --- reading
+
+
+def test_a_missing_or_foreign_store_is_refused(tmp_path, copy):
+    refused(lambda: open_dataset(tmp_path / "nothing.zarr"), "no such data set")
+    refused(lambda: open_dataset(tmp_path), "not a data set")
+    module._update_attributes(copy, {"format": "wlplan.dataset/9"})
+    refused(lambda: open_dataset(copy), "wlplan.dataset/9")
+    (copy / "zarr.json").write_text("{")
+    refused(lambda: open_dataset(copy), "not a data set")
+
+
+@pytest.mark.parametrize("damage", ["missing", "truncated", "no array"])
+def test_a_damaged_store_is_refused(copy, damage):
+    chunk = copy / "h36" / "c" / "1" / "0" / "0"
+    if damage == "missing":
+        chunk.unlink()
+    elif damage == "truncated":
+        chunk.write_bytes(chunk.read_bytes()[:50])
+    else:
+        shutil.rmtree(copy / "h36")
+    refused(lambda: open_dataset(copy), "damaged")
+
+
+def test_the_fingerprint_tells_data_sets_apart(data, store):
+    assert fingerprint(data) == fingerprint(open_dataset(store))
+    other = dataclasses.replace(data, mass=data.mass + 1e-6)
+    assert fingerprint(other) != fingerprint(data)
+
+
+# --- splitting and normalising
+
+
+@pytest.mark.parametrize("rollouts", [3, 10, 41, 360])
+def test_no_rollout_is_in_two_parts(rollouts):
+    whole = numbered(rollouts)
+    parts = split(whole, seed=2)
+    numbers = [np.unique(part.rollout) for part in parts]
+    assert sorted(np.concatenate(numbers)) == list(range(rollouts))
+    assert sum(len(part) for part in parts) == len(whole)
+    assert min(len(part) for part in parts) > 0
+    assert len(numbers[1]) == pytest.approx(0.1 * rollouts, abs=1)
+    again = split(whole, seed=2)
+    np.testing.assert_array_equal(again[2].rollout, parts[2].rollout)
+
+
+def test_too_few_rollouts_are_not_split():
+    refused(lambda: split(numbered(2)), "2 rollouts")
+    refused(lambda: split(numbered(5), fractions=(0.8, -0.1)), "positive")
+
+
+def test_reflecting_twice_changes_nothing(data):
+    np.testing.assert_array_equal(reflect(reflect(data.h52)), data.h52)
+    np.testing.assert_array_equal(reflect(data.h36)[:, :, 0], data.h36[:, :, -1])
+
+
+def test_the_normaliser_maps_the_range_to_one_and_back():
+    table = np.random.default_rng(0).normal(3.0, 2.0, (50, 4)).astype(np.float32)
+    table[:, 3] = 7.0  # never changes
+    normaliser = Normaliser.of(table)
+    unit = np.stack([normaliser.normalise(jnp.asarray(row)) for row in table])
+    np.testing.assert_allclose(unit[:, :3].min(axis=0), 0.0, atol=1e-6)
+    np.testing.assert_allclose(unit[:, :3].max(axis=0), 1.0, atol=1e-6)
+    np.testing.assert_array_equal(unit[:, 3], 0.0)
+    back = np.stack([normaliser.denormalise(jnp.asarray(row)) for row in unit])
+    np.testing.assert_allclose(back, table, rtol=1e-5)
