@@ -38,7 +38,7 @@ CYCLES, SEED = 11, 5
 
 @pytest.fixture(scope="module", autouse=True)
 def _short_rollouts():
-    """Rollouts of 3 loadings, one a group, two a batch: 11 cycles are four rollouts, two batches."""
+    """Rollouts of 3 loadings, one a group, two groups a batch: 11 cycles make two batches."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "LOADS", 3)
         patch.setattr(module, "_GROUP", 1)
@@ -166,12 +166,13 @@ def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike():
 
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30, 31, 47, 449, 451, 1801, 10_718, 10_800])
 def test_the_batches_make_up_the_cycles(cycles, monkeypatch):
-    monkeypatch.undo()
+    for name, value in (("LOADS", 30), ("_GROUP", 15), ("_GROUPS", 4)):
+        monkeypatch.setattr(module, name, value)
     layout = module._Layout(cycles)
-    assert layout.rollouts * module.LOADS >= cycles > (layout.rollouts - 1) * module.LOADS
-    assert 1 <= layout.group <= max(module._GROUP, 1)
+    assert layout.rollouts * 30 >= cycles > (layout.rollouts - 1) * 30
+    assert 1 <= layout.group <= 15
     # A batch starts with a rollout, and with a chunk.
-    assert layout.batch_cycles == cycles or layout.batch_cycles % module.LOADS == 0
+    assert layout.batch_cycles == cycles or layout.batch_cycles % 30 == 0
 
 
 def test_a_hypercube_has_one_point_in_each_slice():

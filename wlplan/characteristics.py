@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 from wlplan.types import Characteristics, LocalHeightmap
 
 # Horizontal part of the mean normal below which the incidence angle fades to zero: on flat ground
-# it has no meaning, and its derivative would grow without bound. Shortens the incidence of a
-# 20 degree slope by less than a thousandth of its value.
-_FLAT = 0.01
+# it has no meaning, and its derivative would grow without bound. Shortens the incidence on a
+# 10 degree slope by a thousandth of its value.
+_FLAT = 0.005
 
 
 @functools.cache

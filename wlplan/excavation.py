@@ -26,7 +26,7 @@ _RISE = math.tan(math.radians(45.0))
 # The strip ends here [m]: the largest penetration, 3.2 m (paper, section 4.2), and the rise of a
 # bucket that breaks out.
 STRIP_LENGTH = 4.5
-_ITERATIONS = 14
+_BISECTIONS, _NEWTON_STEPS = 9, 3
 
 
 class Strip(NamedTuple):
@@ -85,7 +85,7 @@ def excavate(
     frozen = lax.stop_gradient(strip)
     goal = lax.stop_gradient(wanted)
 
-    def bisect(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+    def bisect(_: Array, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bracket
         middle = (low + high) / 2
         short = cut(middle, frozen).sum() < goal
@@ -93,13 +93,23 @@ def excavate(
 
     deepest = jnp.full_like(goal, STRIP_LENGTH)
     shallowest = -jnp.maximum(frozen.above.max() / _RISE, pile.cell_size)
-    low, high = lax.fori_loop(0, _ITERATIONS, bisect, (shallowest, deepest))
-    # One Newton step from the bracket: exact to second order, and the implicit gradient.
-    start = (low + high) / 2
-    amount = cut(start, strip).sum()
-    _, rate = jax.jvp(lambda p: cut(p, frozen).sum(), (start,), (jnp.ones_like(start),))
-    step = jnp.where(rate > 0.0, (wanted - amount) / jnp.where(rate > 0.0, rate, 1.0), 0.0)
-    penetration = jnp.clip(start + step, shallowest, deepest)
-    # The rest, a fraction of a per mille, is met by scaling the cut.
+    low, high = lax.fori_loop(0, _BISECTIONS, bisect, (shallowest, deepest))
+
+    def newton(penetration: Array, strip: Strip, wanted: Array) -> Array:
+        _, rate = jax.jvp(
+            lambda p: cut(p, frozen).sum(),
+            (lax.stop_gradient(penetration),),
+            (jnp.ones_like(goal),),
+        )
+        missing = wanted - cut(penetration, strip).sum()
+        step = jnp.where(rate > 0.0, missing / jnp.where(rate > 0.0, rate, 1.0), 0.0)
+        return jnp.clip(penetration + step, shallowest, deepest)
+
+    # Converge on constants, then one differentiable step from there: the implicit gradient.
+    penetration = lax.fori_loop(
+        0, _NEWTON_STEPS, lambda _, p: newton(p, frozen, goal), (low + high) / 2
+    )
+    penetration = newton(penetration, strip, wanted)
+    # What rounding leaves over is met by scaling the cut.
     removed = take(cut(penetration, strip), strip.weight * strip.above, wanted)
     return pile.replace(height=pile.height - removed), wanted * cell_area

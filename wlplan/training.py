@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 
 from wlplan.dataset import Dataset, Normaliser, fingerprint, split, versions
 from wlplan.errors import InputError
-from wlplan.models.performance import PerformanceModel, PsiLow
+from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel, PsiLow
 
 MODEL_FORMAT = "wlplan.model/1"
 
@@ -400,7 +400,8 @@ def load_model(directory: str | os.PathLike[str]) -> PerformanceModel:
         )
         graph, params = nnx.split(network)
         inputs, outputs = (
-            _normaliser_of_dict(description["normaliser"][name]) for name in ("inputs", "outputs")
+            _normaliser_of_dict(description["normaliser"][name], size)
+            for name, size in (("inputs", INPUTS), ("outputs", OUTPUTS))
         )
         # Checked before orbax reads them: it would report damage at length, or wait.
         if _digests(directory / _WEIGHTS) != description["files"]:
@@ -475,5 +476,8 @@ def _normaliser_to_dict(normaliser: Normaliser) -> dict[str, list[float]]:
     return {name: np.asarray(getattr(normaliser, name)).tolist() for name in ("low", "span")}
 
 
-def _normaliser_of_dict(record: Mapping[str, Any]) -> Normaliser:
-    return Normaliser(*(jnp.asarray(record[name], jnp.float32) for name in ("low", "span")))
+def _normaliser_of_dict(record: Mapping[str, Any], size: int) -> Normaliser:
+    parts = [np.array(record[name], np.float32) for name in ("low", "span")]
+    if any(part.shape != (size,) or not np.isfinite(part).all() for part in parts):
+        raise ValueError("the normaliser does not fit")
+    return Normaliser(*(jnp.asarray(part) for part in parts))

@@ -1,0 +1,306 @@
+"""Laws of training and of models on disk."""
+
+import dataclasses
+import json
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from wlplan import training
+from wlplan.dataset import VARIABLES, Dataset
+from wlplan.errors import InputError
+from wlplan.training import (
+    evaluate_psi_low,
+    held_out,
+    load_model,
+    read_description,
+    save_model,
+    train_psi_low,
+)
+from wlplan.units import ACTION_HIGH
+
+LIGHT = {"epochs": 40, "batch": 64, "hidden": (32, 32), "dropout": 0.0, "learning_rate": 1e-2}
+
+
+def synthetic(rollouts=40, loads=15, seed=0):
+    """Cycles whose outcome is a smooth closed form of characteristics and action."""
+    n = rollouts * loads
+    random = np.random.default_rng(seed)
+    low, high = np.array([0.2, 0.0, -0.2, -0.2]), np.array([0.6, 1.0, 0.3, 0.3])
+    shape = random.uniform(low, high, (n, 4))
+    action = random.uniform(0.0, ACTION_HIGH, (n, 4))
+    mass = 2.0 + 3.0 * shape[:, 0] - 0.5 * shape[:, 1] ** 2 + shape[:, 2] - action[:, 0]
+    time = 8.0 + 3.0 * action[:, 2] + 0.1 * action[:, 1] ** 2
+    work = 120.0 * mass + 20.0 * action[:, 3]
+    columns = {name: np.zeros((n, *v.shape), v.dtype) for name, v in VARIABLES.items()}
+    columns |= {
+        "mass": mass.astype(np.float32),
+        "time": time.astype(np.float32),
+        "work": work.astype(np.float32),
+        "characteristics": shape.astype(np.float32),
+        "action": action.astype(np.float32),
+        "rollout": np.repeat(np.arange(rollouts, dtype=np.int32), loads),
+        "valid": np.ones(n, bool),
+    }
+    return Dataset(**columns, attributes={"seed": seed, "soil": {"density": 1727.0}})
+
+
+@pytest.fixture(scope="module")
+def data():
+    return synthetic()
+
+
+@pytest.fixture(scope="module")
+def saved(data, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("training") / "psi_low"
+    model, report = train_psi_low(data, out=directory, **LIGHT)
+    return directory, model, report
+
+
+@pytest.fixture
+def copy(saved, tmp_path):
+    return shutil.copytree(saved[0], tmp_path / "copy")
+
+
+def refused(call, *words):
+    with pytest.raises(InputError) as error:
+        call()
+    message = str(error.value)
+    assert "\n" not in message
+    assert len(message) > 20
+    for word in words:
+        assert word in message
+
+
+def leaves(model):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(model)]
+
+
+def contents(directory):
+    return {
+        p.relative_to(directory): (p.stat().st_mtime_ns, p.read_bytes())
+        for p in directory.rglob("*")
+        if p.is_file()
+    }
+
+
+# --- training
+
+
+def test_training_learns_a_closed_form(saved):
+    errors = saved[2].loaded
+    assert errors.mean_relative["mass"] < 0.02
+    assert errors.mean_relative["time"] < 0.02
+    assert errors.mean_relative["work"] < 0.02
+    for value in errors.total_relative.values():
+        assert abs(value) < 0.01
+
+
+def test_training_reduces_the_loss(data, saved):
+    description = read_description(saved[0])["training"]
+    short, _ = train_psi_low(data, **{**LIGHT, "epochs": 1})
+    whole = held_out(data, read_description(saved[0]))
+    first = evaluate_psi_low(short, whole).every.mean_absolute
+    assert all(saved[2].every.mean_absolute[name] < 0.5 * first[name] for name in first)
+    assert description["best_validation_loss"] <= description["last_validation_loss"]
+    assert 1 <= description["best_epoch"] <= LIGHT["epochs"]
+
+
+def test_the_same_seed_gives_the_same_weights(data):
+    settings = {**LIGHT, "epochs": 2, "dropout": 0.1}
+    done = []
+    one, _ = train_psi_low(data, seed=4, progress=lambda *n: done.append(n), **settings)
+    same, _ = train_psi_low(data, seed=4, **settings)
+    other, _ = train_psi_low(data, seed=5, **settings)
+    assert done == [(1, 2), (2, 2)]
+    assert all(np.array_equal(a, b) for a, b in zip(leaves(one), leaves(same), strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(leaves(one), leaves(other), strict=True))
+
+
+def test_the_validation_part_chooses_the_weights(data):
+    """A learning rate that blows the network up late must not cost what was learnt before."""
+    x, y = jnp.zeros((64, 8)), jnp.zeros((64, 3))
+    graph, params = training.nnx.split(training.PsiLow((8,), rngs=training.nnx.Rngs(0)))
+    optimiser = training.optax.sgd(1e3)
+    loss = jnp.asarray(1e-9)
+    fit = training.Fit(params, optimiser.init(params), params, loss, jnp.asarray(7))
+    after, _ = training._epoch(
+        graph, optimiser, 32, fit, jax.random.key(0), jnp.asarray(8), (x + 1.0, y), (x + 1.0, y)
+    )
+    assert int(after.best_epoch) == 7
+    assert float(after.best_loss) == pytest.approx(1e-9)
+    best, kept = jax.tree.leaves(after.best), jax.tree.leaves(params)
+    assert all(np.array_equal(a, b) for a, b in zip(best, kept, strict=True))
+
+
+def test_cycles_that_are_not_valid_play_no_role(data, saved):
+    spoilt = dataclasses.replace(data, mass=data.mass.copy(), valid=np.arange(len(data)) % 15 != 0)
+    spoilt.mass[~spoilt.valid] = np.nan
+    _, report = train_psi_low(spoilt, **{**LIGHT, "epochs": 1})
+    assert np.isfinite(report.every.mean_relative["mass"])
+
+
+def test_data_that_cannot_be_trained_on_is_refused(data):
+    few = data.select(data.rollout < 2)
+    refused(lambda: train_psi_low(few, **LIGHT), "2 rollouts")
+    holed = dataclasses.replace(data, time=np.where(data.rollout == 3, np.nan, data.time))
+    refused(lambda: train_psi_low(holed, **LIGHT), "not finite")
+    none = dataclasses.replace(data, valid=np.zeros(len(data), bool))
+    refused(lambda: train_psi_low(none, **LIGHT), "valid")
+    refused(lambda: train_psi_low(data, **{**LIGHT, "epochs": 0}), "at least 1")
+
+
+# --- evaluation
+
+
+def test_the_errors_are_what_they_are_called(saved, data):
+    _, model, _ = saved
+    p = jax.vmap(model)(jnp.asarray(data.characteristics), jnp.asarray(data.action))
+    mass, time, work = (np.asarray(v) for v in (p.mass, p.time, p.work))
+    truth = dataclasses.replace(data, mass=mass / 1.25, time=time - 1.0, work=work)
+    errors = evaluate_psi_low(model, truth).every
+    assert errors.cycles == len(data)
+    assert errors.mean_relative["mass"] == pytest.approx(0.25, rel=1e-4)
+    assert errors.total_relative["mass"] == pytest.approx(0.25, rel=1e-4)
+    assert errors.mean_absolute["time"] == pytest.approx(1.0, rel=1e-4)
+    assert errors.mean_relative["work"] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_empty_buckets_do_not_drown_the_relative_error(saved, data):
+    _, model, _ = saved
+    mass = data.mass.copy()
+    mass[::10] = 0.0
+    some_empty = evaluate_psi_low(model, dataclasses.replace(data, mass=mass))
+    assert some_empty.loaded.mean_relative["mass"] < 0.05
+    assert some_empty.every.mean_relative["mass"] > 10.0
+    assert some_empty.loaded.cycles == np.sum(mass >= 0.5)
+    json.dumps(some_empty.as_dict(), allow_nan=False)
+    empty = dataclasses.replace(data, mass=np.zeros_like(mass))
+    refused(lambda: evaluate_psi_low(model, empty), "nothing to evaluate")
+
+
+def test_only_the_test_part_of_the_training_data_is_held_out(saved, data):
+    description = read_description(saved[0])
+    part = held_out(data, description)
+    assert len(part) == saved[2].every.cycles == description["training"]["cycles"][2]
+    assert evaluate_psi_low(saved[1], part).as_dict() == description["held_out"]
+    other = synthetic(seed=1)
+    assert held_out(other, description) is other
+
+
+# --- models on disk
+
+
+def test_a_model_comes_back_bit_by_bit_and_the_directory_stays_as_it_is(saved):
+    directory, model, _ = saved
+    before = contents(directory)
+    loaded = load_model(directory)
+    assert jax.tree.structure(loaded) == jax.tree.structure(model)
+    for got, want in zip(leaves(loaded), leaves(model), strict=True):
+        assert got.dtype == want.dtype == np.float32
+        np.testing.assert_array_equal(got, want)
+    assert contents(directory) == before
+
+
+def test_a_relative_path_will_do(saved, monkeypatch):
+    monkeypatch.chdir(saved[0].parent)
+    assert leaves(load_model(saved[0].name))
+
+
+def test_a_model_is_small_and_names_no_place_of_this_machine(saved, tmp_path):
+    files = [path for path in saved[0].rglob("*") if path.is_file()]
+    assert len(files) < 20
+    assert sum(path.stat().st_size for path in files) < 100_000
+    here = str(saved[0].parent).encode()
+    assert not any(here in path.read_bytes() for path in files)
+
+
+def test_the_description_says_where_a_model_comes_from(saved, data):
+    description = read_description(saved[0])
+    assert description["format"] == "wlplan.model/1"
+    assert description["kind"] == "psi_low"
+    assert description["architecture"]["hidden"] == [32, 32]
+    assert description["dataset"]["soil"] == data.attributes["soil"]
+    assert description["dataset"]["fingerprint"].startswith("sha256:")
+    assert description["held_out"]["loaded"]["mean_relative"]["mass"] < 0.02
+    assert set(description["versions"]) >= {"wlplan", "jax", "numpy"}
+
+
+def test_saving_replaces_a_model_and_nothing_else(copy, saved, tmp_path):
+    (copy / "weights" / "left.over").write_text("old")
+    save_model(copy, saved[1], {"note": "second"})
+    assert read_description(copy)["note"] == "second"
+    assert not (copy / "weights" / "left.over").exists()
+    load_model(copy)
+
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.txt").write_text("keep me")
+    refused(lambda: save_model(other, saved[1], {}), "not a model")
+    refused(lambda: save_model(other / "thesis.txt", saved[1], {}), "is a file")
+    refused(lambda: save_model(tmp_path / "missing" / "model", saved[1], {}), "folder")
+    assert (other / "thesis.txt").read_text() == "keep me"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["copy", "other"]
+
+
+def test_a_failed_save_leaves_the_old_model(copy, saved, monkeypatch):
+    before = contents(copy)
+
+    def fails(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(training, "_digests", fails)
+    refused(lambda: save_model(copy, saved[1], {}), "No space")
+    assert contents(copy) == before
+    assert [p.name for p in copy.parent.iterdir()] == ["copy"]
+
+
+def test_a_bad_place_is_refused_before_the_training(data, tmp_path):
+    done = []
+    call = {**LIGHT, "progress": lambda *n: done.append(n)}
+    refused(lambda: train_psi_low(data, out=tmp_path / "a" / "b", **call), "folder")
+    assert not done
+
+
+def test_a_missing_or_foreign_model_is_refused(tmp_path, copy):
+    refused(lambda: load_model(tmp_path / "nothing"), "no such model")
+    refused(lambda: load_model(tmp_path), "not a model")
+    document = json.loads((copy / "model.json").read_text())
+    for change in ({"format": "wlplan.model/9"}, {"kind": "psi_high"}):
+        (copy / "model.json").write_text(json.dumps({**document, **change}))
+        refused(lambda: load_model(copy), *change.values())
+    (copy / "model.json").write_text((json.dumps(document))[:200])
+    refused(lambda: load_model(copy), "not a model")
+    (copy / "model.json").write_text("[]")
+    refused(lambda: load_model(copy), "not a model")
+
+
+def test_every_truncated_or_missing_file_is_noticed(copy):
+    files = [path for path in copy.rglob("*") if path.is_file() and path.name != "model.json"]
+    for path in files:
+        content = path.read_bytes()
+        path.write_bytes(content[:-1])
+        refused(lambda: load_model(copy), "damaged")
+        path.unlink()
+        refused(lambda: load_model(copy), "damaged")
+        path.write_bytes(content)
+    load_model(copy)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda d: d.pop("normaliser"),
+        lambda d: d["architecture"].update(hidden=[32, 16]),
+        lambda d: d["architecture"].update(activation="sine"),
+        lambda d: d["normaliser"]["inputs"].update(low=[0.0]),
+    ],
+)
+def test_a_description_that_does_not_fit_the_weights_is_refused(copy, spoil):
+    document = json.loads((copy / "model.json").read_text())
+    spoil(document)
+    (copy / "model.json").write_text(json.dumps(document))
+    refused(lambda: load_model(copy), "damaged")
