@@ -284,6 +284,7 @@ def plan(
     With --out: plan.json, plan.png, totals.png and report.html, which shows everything.
     """
     _check_pile_name(pile_file)
+    _check_model(model, world_name)
     folder = None if out is None else _checked_folder(out)
 
     from wlplan.io import plan_to_dict
@@ -530,6 +531,7 @@ def diggability(
     With --out: diggability.png and diggability.json. Nothing is random, so --seed changes nothing.
     """
     _check_pile_name(pile_file)
+    _check_model(model, world_name)
     folder = None if out is None else _checked_folder(out)
 
     import numpy as np
@@ -687,8 +689,7 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     belongs to the model, so --seed changes nothing.
     """
     _check_is_folder(data, "data set", "wlplan collect")
-    if model is not None:
-        _check_is_folder(model, "model", "wlplan train")
+    _check_model(model, "low")
 
     from wlplan.dataset import open_dataset
     from wlplan.training import evaluate_psi_low, held_out, load_model, read_description
@@ -740,7 +741,17 @@ def _check_pile_name(name: str) -> None:
         )
 
 
+def _check_model(name: str | None, world: str) -> None:
+    if name is None:
+        return
+    if world != "low":
+        raise InputError(f"--model does not go with --world {world}: leave one of them out.")
+    _check_is_folder(name, "model", "wlplan train")
+
+
 def _check_not_a_file(name: str) -> None:
+    if not name.strip():
+        raise InputError("the name of the folder to write to is empty: give one.")
     if os.path.lexists(name) and not os.path.isdir(name):
         raise InputError(f"{name}: is a file: name a folder to write to.")
 
@@ -862,7 +873,7 @@ def _receiver(pile: Pile, truck: tuple[float, ...] | None) -> Receiver:
     if away > _FARTHEST_TRUCK:
         raise InputError(
             f"--truck {x:g},{y:g} lies {away:.0f} m from the middle of the map, which spans x "
-            f"{low[0]:.0f} to {low[0] + size[0]:.0f} and y {low[1]:.0f} to {low[1] + size[1]:.0f} "
+            f"{low[0]:.1f} to {low[0] + size[0]:.1f} and y {low[1]:.1f} to {low[1] + size[1]:.1f} "
             f"m: give it in that frame (whole kilometres of survey coordinates are taken off)."
         )
     dtype = pile.height.dtype
@@ -959,13 +970,14 @@ def _print_plan(document: Mapping[str, Any]) -> None:
     predicted = total.get("predicted", {})
     table = _table(f"{len(document['loads'])} loads from {document['pile']['file']}")
     table.add_column("load")
-    for title in ("x [m]", "y [m]", "heading [°]"):
+    # Short titles: all of it fits a terminal of 80 columns.
+    for title in ("x\n[m]", "y\n[m]", "head.\n[°]"):
         table.add_column(title, justify="right")
     for title, unit, _ in _QUANTITIES.values():
         if predicted:
-            table.add_column(f"{title} [{unit}]\npredicted", justify="right", style="cyan")
-        table.add_column(f"{title} [{unit}]\nsimulated", justify="right", style="yellow")
-    table.add_column("transport\n[s]", justify="right")
+            table.add_column(f"{title}\npred.\n[{unit}]", justify="right", style="cyan")
+        table.add_column(f"{title}\nsim.\n[{unit}]", justify="right", style="yellow")
+    table.add_column("trans-\nport\n[s]", justify="right")
 
     def cells(record: Mapping[str, Any], transport: Mapping[str, float]) -> list[str]:
         row = []
@@ -975,7 +987,8 @@ def _print_plan(document: Mapping[str, Any]) -> None:
         return [*row, f"{transport['time']:.1f}"]
 
     for n, load in enumerate(document["loads"], start=1):
-        place = (f"{load['x']:.2f}", f"{load['y']:.2f}", f"{math.degrees(load['heading']):.0f}")
+        heading = round(math.degrees(load["heading"]))
+        place = (f"{load['x']:.2f}", f"{load['y']:.2f}", f"{heading}")
         last = n == len(document["loads"])
         table.add_row(str(n), *place, *cells(load, load["transport"]), end_section=last)
     table.add_row("sum", "", "", "", *cells(total, total["transport"]), style="bold")
@@ -1000,17 +1013,25 @@ def _print_plan(document: Mapping[str, Any]) -> None:
 
 def _table(title: str) -> Any:
     from rich import box
-    from rich.markup import escape
     from rich.table import Table
 
-    return Table(title=escape(title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    return Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        collapse_padding=True,
+        pad_edge=False,
+    )
 
 
 def _print_table(table: Any) -> None:
     from rich.console import Console
 
     # A file or a pipe has no width of its own: take what the table needs.
-    Console(width=None if sys.stdout.isatty() else 140, highlight=False).print(table)
+    width = None if sys.stdout.isatty() else 140
+    # Units stand in square brackets, which would count as markup.
+    Console(width=width, highlight=False, markup=False).print(table)
 
 
 # --- time

@@ -262,10 +262,9 @@ def collect(
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__
         advice = "free some space" if error.errno == errno.ENOSPC else "choose another place"
-        raise InputError(
-            f"{path}: cannot be written ({reason}): {advice}; the first {done} of {cycles} cycles "
-            f"are safe, and the same command goes on from there."
-        ) from error
+        if done:
+            advice += f"; {done} of {cycles} cycles are safe, the same command goes on from there"
+        raise InputError(f"{path}: cannot be written ({reason}): {advice}.") from error
 
 
 def _play_batch(

@@ -208,7 +208,7 @@ def _loads_table(document: Mapping[str, Any]) -> str:
     rows = []
     for n, load in enumerate(document["loads"], start=1):
         cells = [str(n), _number(load["x"]), _number(load["y"])]
-        cells.append(_number(math.degrees(load["heading"]), 0))
+        cells.append(_number(round(math.degrees(load["heading"])), 0))
         cells += [_number(value) for value in load["action"].values()]
         cells += _pairs(load.get("predicted", {}), load.get("simulated", {}))
         transport = load.get("transport", {})

@@ -1,0 +1,537 @@
+"""The command line: results on stdout, one line on stderr for whatever is wrong, whole files."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from html.parser import HTMLParser
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from wlplan import cli, io, objective, planner, plots, report, worlds
+from wlplan.diggability import edge_poses
+from wlplan.errors import InputError
+from wlplan.machine import GRAVEL
+from wlplan.pile import seed_pile, toe_contour
+from wlplan.planner import PlanResult
+from wlplan.types import Action, LoadingPlan, Performance, Pose, Rollout
+
+FILES = ["plan.json", "plan.png", "report.html", "totals.png"]
+
+
+class FakeWorld:
+    """A world of simple numbers; `fake_play` says what a whole plan does in it."""
+
+    soil = GRAVEL
+
+    def __init__(self, factor):
+        self.factor = factor
+
+    def __call__(self, pile, pose, action):
+        """The pile as it was."""
+        mass = 2.0 * self.factor + 0.0 * pose.x
+        performance = Performance(mass, 10.0 + action.k_bm, 300.0 + pose.x)
+        return pile, performance
+
+
+def fake_play(world, pile, plan, *, objective="efficiency", receiver=None):
+    count = len(plan.pose.x)
+    mass = jnp.asarray(world.factor * np.linspace(1.0, 3.0, count), jnp.float32)
+    height = np.asarray(pile.height, np.float64)
+    lost = float(mass.sum()) / (GRAVEL.density / 1000.0) / pile.cell_size**2
+    after = pile.replace(height=jnp.asarray(height - lost * height / height.sum(), jnp.float32))
+    performance = Performance(mass, jnp.full(count, 10.0), jnp.full(count, 300.0))
+    return PlanResult(
+        plan=plan,
+        rollout=Rollout(performance, after),
+        transport_time=jnp.full(count, 20.0),
+        transport_work=jnp.full(count, 100.0),
+        costs=jnp.full(count, 1.0),
+        cost=jnp.asarray(float(count)) / world.factor,
+    )
+
+
+@pytest.fixture
+def calls():
+    """Arguments of the calls of the planner, in order."""
+    return []
+
+
+@pytest.fixture
+def real_figures():
+    """Asked for by the tests that want them."""
+
+
+@pytest.fixture(autouse=True)
+def fakes(monkeypatch, calls, request):
+    """Stand-ins for what takes long; the pile and the files are real."""
+
+    def plan_loads(world, pile, *, loads, progress, **options):
+        calls.append({"loads": loads, **options})
+        pose = edge_poses(toe_contour(pile), loads)
+        plan = LoadingPlan(
+            Pose(*(jnp.asarray(v, jnp.float32) for v in (pose.x, pose.y, pose.heading))),
+            Action(*(jnp.full(loads, value) for value in (0.5, 2.0, 0.5, 2.0))),
+        )
+        for done in range(loads):
+            progress("steps", done + 1, loads, 3.0)
+        return fake_play(world, pile, plan)
+
+    def load_world(name, *, model=None):
+        if name in ("high", "hybrid"):
+            raise InputError(f"the {name} world\nis not there yet; use low")
+        return FakeWorld(1.0 if name == "simulator" else 1.1)
+
+    monkeypatch.setattr(planner, "plan_loads", plan_loads)
+    monkeypatch.setattr(planner, "play", fake_play)
+    monkeypatch.setattr(worlds, "load_world", load_world)
+    if "real_figures" not in request.fixturenames:
+        for name in ("plan_figure", "totals_figure", "diggability_figure"):
+            monkeypatch.setattr(plots, name, lambda *_, **__: Figure(figsize=(1.0, 1.0)))
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """A pile file."""
+    path = tmp_path / "scan.npz"
+    io.write_pile(path, seed_pile("conical", slope=math.radians(30.0), height=2.0, seed=1))
+    return str(path)
+
+
+@pytest.fixture
+def run(capsys):
+    """Run the command line; returns exit code, stdout and stderr."""
+
+    def run_words(*words):
+        capsys.readouterr()
+        code = cli.main([str(word) for word in words])
+        return code, *capsys.readouterr()
+
+    return run_words
+
+
+def refused(result, *words):
+    code, out, err = result
+    assert code == 2
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert err.endswith("\n")
+    for word in words:
+        assert word in err
+    return err
+
+
+def strict_json(text):
+    def fail(constant):
+        raise AssertionError(f"{constant} in JSON")
+
+    return json.loads(text, parse_constant=fail)
+
+
+# --- plan
+
+
+def test_a_plan_is_written_with_figures_and_report(run, scan, tmp_path, real_figures):
+    code, out, err = run("plan", scan, "--loads", 3, "--out", tmp_path / "out")
+    assert code == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
+    assert "predicted" in out
+    assert "simulated" in out
+    assert "compiling" in out
+    for unit in ("[t]", "[s]", "[kJ]", "[m]"):
+        assert unit in out
+    assert "report.html" in out
+    assert "error" not in err
+    assert (tmp_path / "out" / "plan.png").read_bytes()[:4] == b"\x89PNG"
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+def test_json_on_stdout_is_plan_json_and_nothing_else(run, scan, tmp_path):
+    code, out, err = run("plan", scan, "--loads", 2, "--json", "--out", tmp_path / "out")
+    assert code == 0
+    assert out == (tmp_path / "out" / "plan.json").read_text()
+    assert "steps" in err
+
+
+def test_plan_json_holds_what_the_contract_says(run, scan):
+    code, out, _ = run("plan", scan, "--loads", 3, "--seed", 5, "--truck", "-12,1,30", "--json")
+    document = strict_json(out)
+    assert code == 0
+    assert document["format"] == "wlplan.plan/1"
+    assert (document["world"], document["objective"], document["seed"]) == ("low", "efficiency", 5)
+    assert document["pile"]["file"] == scan
+    assert document["receiver"]["heading"] == pytest.approx(math.radians(30.0))
+    assert len(document["loads"]) == 3
+    for load in document["loads"]:
+        assert set(load) == {"x", "y", "heading", "action", "predicted", "transport", "simulated"}
+        assert set(load["action"]) == {"delta_bm", "k_bm", "delta_bk", "k_bk"}
+        assert set(load["predicted"]) == set(load["simulated"]) == {"mass", "time", "work"}
+        assert set(load["transport"]) == {"time", "work"}
+    for part in ("predicted", "simulated"):
+        total = document["total"][part]
+        for name in ("mass", "time", "work"):
+            want = sum(load[part][name] for load in document["loads"])
+            assert total[name] == pytest.approx(want, rel=1e-6)
+        assert math.isfinite(total["cost"])
+    ledger = document["ledger"]
+    lost = ledger["density"] * (ledger["volume_before"] - ledger["volume_after"])
+    assert ledger["mass_removed"] == pytest.approx(lost, rel=1e-4)
+    assert ledger["mass_removed"] == pytest.approx(document["total"]["simulated"]["mass"])
+
+
+def test_the_options_reach_the_planner(run, scan, calls):
+    options = ("--loads", 2, "--planner", "greedy", "--objective", "energy", "--seed", 7)
+    run("plan", scan, *options, "--truck", "-10,0")
+    (call,) = calls
+    assert (call["loads"], call["planner"], call["objective"], call["seed"]) == (
+        2,
+        "greedy",
+        "energy",
+        7,
+    )
+    assert float(call["receiver"].x) == -10.0
+    # Without a heading the one that suits: straight on, away from or past the pile, not back.
+    assert math.cos(float(call["receiver"].heading)) < 0.9
+
+
+def test_without_a_pile_the_bundled_one_is_planned(run):
+    code, out, _ = run("plan", "--loads", 1, "--json")
+    assert code == 0
+    assert "bundled" in json.loads(out)["pile"]["file"]
+
+
+def test_a_plan_in_the_simulator_predicts_what_is_simulated(run, scan):
+    _, out, _ = run("plan", scan, "--loads", 2, "--world", "simulator", "--json")
+    for load in json.loads(out)["loads"]:
+        assert load["predicted"] == load["simulated"]
+
+
+def test_other_files_in_the_folder_stay(run, scan, tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("mine")
+    (folder / "plan.json").write_text("old")
+    assert run("plan", scan, "--loads", 1, "--out", folder)[0] == 0
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*FILES, "notes.txt"])
+    assert (folder / "notes.txt").read_text() == "mine"
+    assert json.loads((folder / "plan.json").read_text())["format"] == "wlplan.plan/1"
+
+
+@pytest.mark.parametrize("exists", [False, True])
+@pytest.mark.parametrize(
+    ("stop", "code"), [(KeyboardInterrupt(), 130), (OSError(28, "No space left on device"), 2)]
+)
+def test_a_run_that_is_cut_short_leaves_nothing(
+    run, scan, tmp_path, monkeypatch, exists, stop, code
+):
+    folder = tmp_path / "out"
+    if exists:
+        folder.mkdir()
+        (folder / "plan.json").write_text("old")
+
+    def write_report(*_, **__):
+        raise stop
+
+    monkeypatch.setattr(report, "write_report", write_report)
+    got, out, err = run("plan", scan, "--loads", 1, "--out", folder)
+    assert got == code
+    assert out == ""
+    assert err.splitlines()[-1].startswith("error: ")
+    if exists:
+        assert [path.name for path in folder.iterdir()] == ["plan.json"]
+        assert (folder / "plan.json").read_text() == "old"
+    else:
+        assert not folder.exists()
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["scan.npz"]
+
+
+def test_numbers_that_are_not_finite_are_refused(run, scan, tmp_path, monkeypatch):
+    def broken(*arguments, **options):
+        result = fake_play(*arguments, **options)
+        return result.replace(cost=jnp.asarray(jnp.nan))
+
+    monkeypatch.setattr(planner, "play", broken)
+    code, out, err = run("plan", scan, "--loads", 1, "--json", "--out", tmp_path / "out")
+    assert code == 2
+    assert out == ""
+    assert "not finite" in err.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_ledger_that_does_not_close_is_told(run, scan, tmp_path, monkeypatch):
+    def leaky(world, pile, plan, **options):
+        result = fake_play(world, pile, plan, **options)
+        return result.replace(rollout=Rollout(result.rollout.performance, pile))
+
+    monkeypatch.setattr(planner, "play", leaky)
+    code, _, err = run("plan", scan, "--loads", 1, "--out", tmp_path / "out")
+    assert code == 0
+    assert "note: the ledger" in err
+    assert "does not close" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_fault_of_ours_is_one_line_too(run, scan, monkeypatch):
+    def plan_loads(*_, **__):
+        raise ZeroDivisionError("what\nelse")
+
+    monkeypatch.setattr(planner, "plan_loads", plan_loads)
+    code, out, err = run("plan", scan)
+    assert (code, out) == (1, "")
+    assert err.count("\n") == 1
+    assert "what else" in err
+
+
+# --- simulate
+
+
+def test_a_written_plan_is_played_again(run, scan, tmp_path):
+    run("plan", scan, "--loads", 3, "--truck", "-12,1,30", "--out", tmp_path / "out")
+    path = tmp_path / "out" / "plan.json"
+    code, out, _ = run("simulate", scan, path)
+    assert code == 0
+    assert "predicted" in out
+    again, planned = (
+        json.loads(run("simulate", scan, path, "--json")[1]),
+        json.loads(path.read_text()),
+    )
+    assert again["receiver"] == pytest.approx(planned["receiver"])
+    assert again["ledger"] == planned["ledger"]
+    for part in ("predicted", "simulated"):
+        assert again["total"][part] == pytest.approx(planned["total"][part])
+        for one, two in zip(again["loads"], planned["loads"], strict=True):
+            assert one[part] == pytest.approx(two[part])
+
+
+def test_a_bare_plan_is_played_too(run, scan, tmp_path):
+    action = {"delta_bm": 0.5, "k_bm": 2, "delta_bk": 0.5, "k_bk": 2}
+    load = {"x": 3.0, "y": 0.0, "heading": 3.1, "action": action}
+    path = tmp_path / "plan.json"
+    path.write_text(json.dumps({"format": "wlplan.plan/1", "loads": [load]}))
+    code, out, _ = run("simulate", scan, path)
+    assert code == 0
+    assert "predicted" not in out
+    document = strict_json(run("simulate", scan, path, "--json")[1])
+    assert "predicted" not in document["total"]
+    assert document["total"]["simulated"]["mass"] > 0.0
+
+
+def test_a_plan_for_another_pile_is_told(run, scan, tmp_path):
+    run("plan", "--loads", 1, "--out", tmp_path / "out")
+    code, _, err = run("simulate", scan, tmp_path / "out" / "plan.json")
+    assert code == 0
+    assert "another pile" in err
+
+
+def test_a_plan_that_is_none_is_refused(run, scan, tmp_path):
+    path = tmp_path / "plan.json"
+    path.write_text("{}")
+    refused(run("simulate", scan, path), str(path))
+    refused(run("simulate", scan, tmp_path / "none.json"), "no such plan")
+    refused(run("simulate", scan), "PLAN.json")
+
+
+# --- diggability
+
+
+def test_a_map_is_written(run, scan, tmp_path, monkeypatch, real_figures):
+    monkeypatch.setattr(worlds, "load_world", lambda name, **_: FakeWorld(1.0).__call__)
+    words = ("diggability", scan, "--locations", 20, "--action", "0.1,2,0.3,4")
+    code, out, _ = run(*words, "--out", tmp_path / "out")
+    assert code == 0
+    assert "median" in out
+    assert "mass [t]" in out
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "diggability.json",
+        "diggability.png",
+    ]
+    document = strict_json((tmp_path / "out" / "diggability.json").read_text())
+    assert document["action"] == {"delta_bm": 0.1, "k_bm": 2.0, "delta_bk": 0.3, "k_bk": 4.0}
+    assert len(document["locations"]) == 20
+    assert {load["time"] for load in document["locations"]} == {12.0}
+    assert strict_json(run(*words, "--json")[1]) == document
+
+
+# --- errors
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["dig"], "dig"),
+        (["plan", "--lods", "3"], "--loads"),
+        (["plan", "--loads", "0"], "--loads"),
+        (["plan", "--loads", "many"], "--loads"),
+        (["plan", "--loads"], "--loads"),
+        (["plan", "--world", "moon"], "simulator"),
+        (["plan", "--planner", "magic"], "gradient"),
+        (["plan", "--objective", "fun"], "efficiency"),
+        (["plan", "--truck", "here"], "X,Y"),
+        (["plan", "--truck", "1"], "X,Y"),
+        (["plan", "--truck", "1,nan"], "finite"),
+        (["plan", "--truck", "1,2,3,4"], "X,Y"),
+        (["plan", "--seed", "-1"], "--seed"),
+        (["plan", "--seed", "0.5"], "--seed"),
+        (["plan", "a.npz", "b.npz"], "b.npz"),
+        (["plan", "missing.npz"], "no such pile"),
+        (["plan", "."], "folder"),
+        (["plan", "--out", ""], "empty"),
+        (["plan", "--model", "missing"], "no such model"),
+        (["plan", "--model", ".", "--world", "simulator"], "--model"),
+        (["simulate", "bundled"], "PLAN.json"),
+        (["diggability", "--locations", "-3"], "--locations"),
+        (["diggability", "--action", "0.68,4.51,0.17"], "DELTA_BM"),
+        (["diggability", "--action", "0.9,4,0.1,4"], "delta_bm is 0.9"),
+        (["diggability", "--action", "0.6,4,0.1,-4"], "k_bk is -4"),
+        (["collect", "--out", "x.zarr", "--cycles", "0"], "--cycles"),
+        (["collect"], "--out"),
+        (["train"], "MODEL"),
+        (["train", "psi-nothing", "--data", "a", "--out", "b"], "psi-low"),
+        (["train", "psi-low", "--data", "missing", "--out", "b"], "wlplan collect"),
+        (["evaluate"], "--data"),
+        (["evaluate", "--data", "missing"], "no such data set"),
+    ],
+)
+def test_bad_usage_is_one_line(run, tmp_path, monkeypatch, words, told):
+    monkeypatch.chdir(tmp_path)
+    refused(run(*words), told)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_input_is_one_line(run, scan, tmp_path):
+    (tmp_path / "bad.npz").write_text("no pile")
+    (tmp_path / "pile.doc").write_text("no pile")
+    (tmp_path / "file").write_text("mine")
+    refused(run("plan", tmp_path / "bad.npz"), "bad.npz")
+    refused(run("plan", tmp_path / "pile.doc"), ".laz")
+    refused(run("plan", scan, "--out", tmp_path / "file"), "is a file")
+    refused(run("plan", scan, "--out", tmp_path / "file" / "below"), "is a file")
+    refused(run("plan", scan, "--world", "hybrid"), "not there yet")
+    refused(run("plan", scan, "--truck", "0,0"), "on the pile")
+    refused(run("plan", scan, "--truck", "4000,0"), "frame")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a folder that nobody can write")
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_runs(run, scan, calls):
+    refused(run("plan", scan, "--out", "/proc/out"), "cannot be written")
+    assert calls == []
+
+
+def test_a_folder_in_the_way_of_a_file_is_told(run, scan, tmp_path):
+    (tmp_path / "out" / "plan.png").mkdir(parents=True)
+    code, out, err = run("plan", scan, "--loads", 1, "--out", tmp_path / "out")
+    assert (code, out) == (2, "")
+    assert "plan.png" in err.splitlines()[-1]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["plan.png"]
+
+
+# --- help, names, report
+
+
+@pytest.mark.parametrize("command", sorted(cli.wlplan.commands))
+def test_every_command_explains_itself_and_has_the_common_options(run, command):
+    code, out, err = run(command, "--help")
+    assert (code, err) == (0, "")
+    for option in ("--seed", "--json", "--help"):
+        assert option in out
+
+
+def test_no_command_shows_the_help(run):
+    code, out, err = run()
+    assert (code, err) == (0, "")
+    assert "diggability" in out
+
+
+def test_the_names_offered_are_those_that_exist():
+    assert cli.WORLDS == worlds.WORLDS
+    assert cli.PLANNERS == planner.PLANNERS
+    assert tuple(objective.OBJECTIVES) == cli.OBJECTIVES
+    assert tuple(io._READERS) == cli._PILE_ENDINGS
+
+
+class _Strict(HTMLParser):
+    """Follows the nesting of tags and collects what a page would load from elsewhere."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.links = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.links += [value for name, value in attrs if name in ("src", "href")]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_report_stands_alone_and_escapes_names(run, tmp_path):
+    name = "<b>&'x\".npz"
+    path = tmp_path / name
+    io.write_pile(path, seed_pile("conical", slope=math.radians(30.0), height=2.0, seed=1))
+    run("plan", path, "--loads", 1, "--out", tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "<b>&'x" not in page
+    assert "&lt;b&gt;&amp;&#x27;x&quot;.npz" in page
+    parser = _Strict()
+    parser.feed(page)
+    assert parser.open == []
+    assert len(parser.links) == 2
+    assert all(link.startswith("data:image/png;base64,") for link in parser.links)
+    assert "<script" not in page
+
+
+def test_compiling_inside_of_tracing_counts_once(monkeypatch):
+    watch = cli._Stopwatch()
+    with watch:
+        now = time.perf_counter()
+        monkeypatch.setattr(cli, "_compilations", [(now, now + 2.0), (now + 1.0, now + 2.0)])
+        watch._first = 0
+    assert watch.compiling == pytest.approx(2.0)
+
+
+# --- as a process
+
+
+def process(*words, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "wlplan", *words],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        **options,
+    )
+
+
+def test_help_is_quick_and_imports_nothing_heavy():
+    code = (
+        "import sys, wlplan.cli; "
+        "print([name for name in ('jax', 'matplotlib', 'scipy', 'numpy') if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_bad_usage_as_a_process(tmp_path):
+    done = process("plan", "--loads", "0", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_bad_input_as_a_process(tmp_path):
+    (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04")
+    done = process("plan", "bad.npz", "--out", "out", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: bad.npz")
+    assert done.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.npz"]

@@ -1,0 +1,168 @@
+"""Figures come out for odd cases too, as valid PNG, and labels stay readable when crowded."""
+
+import itertools
+import math
+import struct
+import zlib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from wlplan import plots
+from wlplan.diggability import DiggabilityMap, edge_poses
+from wlplan.errors import InputError
+from wlplan.pile import seed_pile, toe_contour
+from wlplan.transport import Receiver
+from wlplan.types import Action, LoadingPlan, Performance, Pose
+
+
+@pytest.fixture(scope="module")
+def pile():
+    return seed_pile("conical", slope=math.radians(30.0), height=2.0, seed=1)
+
+
+def receiver_at(x, y, heading=0.5):
+    return Receiver(*(jnp.asarray(value) for value in (x, y, heading)))
+
+
+def plan_at(x, y, heading):
+    count = len(x)
+    return LoadingPlan(
+        Pose(*(jnp.asarray(values, jnp.float32) for values in (x, y, heading))),
+        Action(*(jnp.full(count, value) for value in (0.5, 2.0, 0.5, 2.0))),
+    )
+
+
+def plan_of(pile, loads):
+    pose = edge_poses(toe_contour(pile), 150)
+    return plan_at(*(np.asarray(leaf)[:loads] for leaf in (pose.x, pose.y, pose.heading)))
+
+
+def performance_of(loads, seed=0):
+    random = np.random.default_rng(seed)
+    return Performance(*(jnp.asarray(random.uniform(1.0, 3.0, loads)) for _ in range(3)))
+
+
+def size_of(png):
+    """Width and height of a PNG whose chunks are all intact."""
+    assert png[:8] == b"\x89PNG\r\n\x1a\n"
+    at, kinds = 8, []
+    while at < len(png):
+        length, kind = struct.unpack(">I4s", png[at : at + 8])
+        body = png[at + 4 : at + 8 + length]
+        assert zlib.crc32(body) == struct.unpack(">I", png[at + 8 + length : at + 12 + length])[0]
+        kinds.append(kind)
+        at += length + 12
+    assert kinds[-1] == b"IEND"
+    return struct.unpack(">II", png[16:24])
+
+
+def drawn(figure):
+    width, height = size_of(plots.png_bytes(figure, dpi=40))
+    assert min(width, height) > 100
+    return figure
+
+
+@pytest.mark.parametrize("loads", [1, 3, 40])
+def test_a_plan_is_drawn(pile, loads):
+    figure = drawn(plots.plan_figure(pile, pile, plan_of(pile, loads)))
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert texts == [str(n) for n in range(1, loads + 1)]
+
+
+def test_a_truck_is_drawn_near_and_pointed_at_far_away(pile):
+    for place, words in (((-12.0, -3.0), "truck"), ((300.0, 40.0), "m")):
+        figure = drawn(
+            plots.plan_figure(pile, pile, plan_of(pile, 3), receiver=receiver_at(*place))
+        )
+        assert all(any(words in t.get_text() for t in panel.texts) for panel in figure.axes[:2])
+        width = np.ptp(figure.axes[0].get_xlim())
+        assert width < 60.0
+
+
+def test_unseen_cells_are_hatched(pile):
+    valid = np.ones(pile.height.shape, bool)
+    valid[:20], valid[40:44, 50:60] = False, False
+    hatched = plots.plan_figure(pile.replace(valid=jnp.asarray(valid)), pile, plan_of(pile, 2))
+    drawn(hatched)
+    assert "not seen" in hatched.get_supxlabel()
+    assert "not seen" not in plots.plan_figure(pile, pile, plan_of(pile, 2)).get_supxlabel()
+
+
+def test_a_pile_that_runs_over_the_edge_of_the_map_is_drawn(pile):
+    half = pile.replace(height=pile.height[: pile.height.shape[0] // 2])
+    assert not toe_contour(half).closed
+    drawn(plots.plan_figure(half, half, plan_of(half, 5)))
+
+
+def test_a_pile_that_is_dug_away_is_drawn(pile):
+    drawn(plots.plan_figure(pile, pile.replace(height=pile.height * 0.0), plan_of(pile, 2)))
+
+
+def test_crowded_labels_do_not_overlap_nor_cover_the_pile(pile):
+    random = np.random.default_rng(0)
+    digs = np.array([3.4, 0.0]) + random.normal(0.0, 0.3, (40, 2))
+    heading = math.pi + random.normal(0.0, 0.2, 40)
+    radius = 0.4
+    labels = plots._label_places(digs, heading, radius, pile)
+    apart = [np.hypot(*(a - b)) for a, b in itertools.combinations(labels, 2)]
+    assert min(apart) > 2.0 * radius
+    assert not plots._on_pile(labels, pile).any()
+    assert plots._first_crossing(digs, labels) is None
+
+
+def test_crossing_lines_are_found():
+    starts, ends = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0, 1.0], [0.0, 1.0]])
+    assert plots._first_crossing(starts, ends) == (0, 1)
+    assert plots._first_crossing(starts, ends[::-1]) is None
+
+
+def test_slopes_that_face_the_light_are_brighter():
+    x = np.arange(20.0)[:, np.newaxis] * np.ones(20)
+    level, west, east = (plots._relief(slope * x, 1.0) for slope in (0.0, 0.5, -0.5))
+    np.testing.assert_allclose(level, 1.0)
+    assert west.min() > 1.0 > east.max()
+
+
+@pytest.mark.parametrize("loads", [1, 15])
+def test_totals_are_drawn_with_and_without_a_simulation(loads):
+    figure = drawn(plots.totals_figure(performance_of(loads), performance_of(loads, 1)))
+    assert len(figure.axes) == 6
+    assert "difference" in figure.axes[3].texts[0].get_text()
+    drawn(plots.totals_figure(performance_of(loads)))
+
+
+def test_totals_of_empty_loads_are_drawn():
+    nothing = Performance(*(jnp.zeros(3) for _ in range(3)))
+    drawn(plots.totals_figure(nothing, nothing))
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_a_diggability_map_is_drawn_also_where_all_is_the_same(pile, spread):
+    pose = edge_poses(toe_contour(pile), 30)
+    performance = Performance(*(2.0 + spread * np.linspace(0.0, 1.0, 30) for _ in range(3)))
+    figure = drawn(plots.diggability_figure(pile, DiggabilityMap(pose, performance)))
+    assert sum(patch.get_height() for patch in figure.axes[3].patches) == 30
+
+
+def test_a_map_of_one_location_is_drawn(pile):
+    pose = edge_poses(toe_contour(pile), 1)
+    one = Performance(*(np.ones(1) for _ in range(3)))
+    drawn(plots.diggability_figure(pile, DiggabilityMap(pose, one)))
+
+
+def test_figures_are_saved_in_one_piece_or_not_at_all(tmp_path):
+    figure = plots.totals_figure(performance_of(2))
+    plots.save_figure(tmp_path / "totals.png", figure, dpi=40)
+    size_of((tmp_path / "totals.png").read_bytes())
+    assert [path.name for path in tmp_path.iterdir()] == ["totals.png"]
+    with pytest.raises(InputError, match="cannot be written"):
+        plots.save_figure(tmp_path / "missing" / "totals.png", figure, dpi=40)
+
+
+def test_the_same_figure_gives_the_same_bytes(pile):
+    one, two = (
+        plots.png_bytes(plots.plan_figure(pile, pile, plan_of(pile, 2)), dpi=40) for _ in range(2)
+    )
+    assert one == two
