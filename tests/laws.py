@@ -34,7 +34,8 @@ def assert_gradient(function, point, *, step=1e-6, relative=1e-4, absolute=0.0, 
 
     def value(vector):
         parts = np.split(vector, np.cumsum(sizes)[:-1])
-        rebuilt = [jnp.asarray(p.reshape(leaf.shape)) for p, leaf in zip(parts, leaves, strict=True)]
+        pairs = zip(parts, leaves, strict=True)
+        rebuilt = [jnp.asarray(p.reshape(leaf.shape)) for p, leaf in pairs]
         return function(jax.tree.unflatten(tree, rebuilt))
 
     compiled = jax.jit(value)

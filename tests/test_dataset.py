@@ -20,7 +20,6 @@ from wlplan.dataset import (
     choose_pose,
     collect,
     fingerprint,
-    latin_hypercube,
     open_dataset,
     reflect,
     split,
@@ -29,6 +28,7 @@ from wlplan.errors import InputError
 from wlplan.heightmap import sample_local
 from wlplan.machine import GRAVEL
 from wlplan.pile import SEED_PILES, seed_pile
+from wlplan.sampling import latin_hypercube
 from wlplan.simulator import STOP_REASONS, Simulator
 from wlplan.types import Pile, Pose
 from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE

@@ -28,7 +28,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from wlplan.machine import GRAVEL
-from wlplan.types import Pile
+from wlplan.types import Pile, Pose
 
 # Part of the excess height that an edge moves in one sweep; 1 / (number of neighbours) is the
 # largest value at which a sweep is non-expansive.
@@ -62,6 +62,10 @@ class Terrain(NamedTuple):
 
     ground: Float[Array, "nx ny"] | None = None
     active: Bool[Array, "nx ny"] | None = None
+
+
+OPEN_TERRAIN = Terrain()
+"""A level floor at 0, and every cell takes part."""
 
 
 def _neighbour(field: Array, i: int, j: int) -> Array:
@@ -214,7 +218,7 @@ def settle(
     *,
     cell_size: float,
     repose_angle: float,
-    terrain: Terrain = Terrain(),
+    terrain: Terrain = OPEN_TERRAIN,
     schedule: Schedule = DEFAULT_SCHEDULE,
 ) -> Float[Array, "nx ny"]:
     """Relaxes a disturbed surface, coarse to fine, with a fixed amount of work.
@@ -287,9 +291,7 @@ def relax(
 
     @jax.checkpoint
     def work(height: Array) -> Array:
-        return settle_window(
-            pile.replace(height=height), repose_angle=repose_angle, schedule=once
-        )
+        return settle_window(pile.replace(height=height), repose_angle=repose_angle, schedule=once)
 
     def one_pass(height: Array, _: None) -> tuple[Array, None]:
         steep = jnp.tan(steepest_slope(movable.replace(height=height))) > limit
@@ -342,9 +344,7 @@ def window_of(pile: Pile, pose: Pose) -> tuple[Pile, tuple[Array, Array]]:
     )
     sizes = tuple(min(WINDOW, n) for n in pile.height.shape)
     start = tuple(
-        jnp.clip(
-            jnp.round(lax.stop_gradient(position)).astype(jnp.int32) - size // 2, 0, n - size
-        )
+        jnp.clip(jnp.round(lax.stop_gradient(position)).astype(jnp.int32) - size // 2, 0, n - size)
         for position, size, n in zip(centre, sizes, pile.height.shape, strict=True)
     )
 

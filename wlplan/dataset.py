@@ -49,6 +49,7 @@ from wlplan.heightmap import (
     to_world,
 )
 from wlplan.pile import SEED_PILES, seed_pile, toe_contour
+from wlplan.sampling import latin_hypercube
 from wlplan.simulator import STOP_REASONS, Simulator
 from wlplan.types import Action, Characteristics, Pile, Pose
 from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE, J_PER_KJ
@@ -430,14 +431,6 @@ def _play(
     return jax.vmap(play)(height, pose, action)
 
 
-def latin_hypercube(
-    points: int, dimensions: int, random: np.random.Generator
-) -> Float[np.ndarray, "n d"]:
-    """Points in the unit cube, one in each of `points` slices of equal width along every axis."""
-    slices = np.stack([random.permutation(points) for _ in range(dimensions)], axis=-1)
-    return (slices + random.random(slices.shape)) / points
-
-
 @functools.cache
 def _grid_shape() -> tuple[int, int]:
     """The smallest grid that holds each of the seed piles [cells]."""
@@ -453,7 +446,7 @@ def _on_grid(pile: Pile, shape: tuple[int, int]) -> Pile:
     return dataclasses.replace(
         pile,
         height=jnp.pad(pile.height, [(r, r) for r in rim]),
-        origin=pile.origin - CELL_SIZE * np.array(rim, pile.height.dtype),
+        origin=jnp.asarray(pile.origin) - CELL_SIZE * jnp.asarray(rim, pile.height.dtype),
     )
 
 
@@ -756,8 +749,7 @@ def reflect(maps: Float[np.ndarray, "*n i j"]) -> Float[np.ndarray, "*n i j"]:
 
 
 @no_type_check
-@struct.dataclass
-class Normaliser:
+class Normaliser(struct.PyTreeNode):
     """Maps the range of the training data to [0, 1], component by component. Paper, section 5.4."""
 
     low: Float[Array, " k"]

@@ -21,8 +21,7 @@ PAPER_ACTION = Action(0.68, 4.51, 0.17, 4.46)  # type: ignore[arg-type]
 
 
 @no_type_check
-@struct.dataclass
-class DiggabilityMap:
+class DiggabilityMap(struct.PyTreeNode):
     """Dig poses around a pile and the performance predicted at each, leaves [n]."""
 
     pose: Pose

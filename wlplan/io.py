@@ -186,8 +186,8 @@ def _to_pile(scan: _Scan, ground: Array | np.ndarray | float | None) -> Pile:
     )
     if floor is None:
         found = _floats(estimate_ground(pile.height, CELL_SIZE, pile.valid))
-        pile = pile.replace(ground=jnp.minimum(found, pile.height))  # type: ignore[attr-defined]
-    return pile.replace(cell_size=CELL_SIZE)  # type: ignore[attr-defined]
+        pile = pile.replace(ground=jnp.minimum(found, pile.height))
+    return pile.replace(cell_size=CELL_SIZE)
 
 
 def _check_size(shape: tuple[int, ...], cell_size: float) -> None:

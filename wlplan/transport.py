@@ -8,6 +8,7 @@ what an arc of the least radius adds. Obstacles, the pile itself among them, are
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import no_type_check
 
@@ -41,8 +42,7 @@ _BLEND = 0.3
 
 
 @no_type_check
-@struct.dataclass
-class Receiver:
+class Receiver(struct.PyTreeNode):
     """Where the loader stands when it dumps into the truck or hopper, world frame."""
 
     x: Float[Array, ""]  # [m]
@@ -96,29 +96,31 @@ def v_turn_length(
     back = machine.approach_distance
     start_x = pose.x - back * jnp.cos(pose.heading)
     start_y = pose.y - back * jnp.sin(pose.heading)
-    lengths = []
-    for deviation in _DEVIATION:
+    deviation, chord, arc = (jnp.asarray(a, jnp.result_type(pose.x)) for a in _turning_points())
+    turn_x = start_x - chord * jnp.cos(pose.heading + deviation)
+    turn_y = start_y - chord * jnp.sin(pose.heading + deviation)
+    dx, dy = receiver.x - turn_x, receiver.y - turn_y
+    # The offset keeps the derivative finite where the turning point meets the receiver.
+    distance = jnp.sqrt(dx**2 + dy**2 + 1e-4)
+    bearing = jnp.arctan2(dy, dx)
+    lengths = (
+        arc
+        + distance
         # The chord of an arc deviates by half of what the heading turns.
-        least = 2.0 * TURNING_RADIUS * math.sin(abs(deviation))
-        stretch = deviation / math.sin(deviation) if deviation else 1.0
-        for reversing in _REVERSING:
-            chord = max(reversing, least)
-            turn_x = start_x - chord * jnp.cos(pose.heading + deviation)
-            turn_y = start_y - chord * jnp.sin(pose.heading + deviation)
-            dx, dy = receiver.x - turn_x, receiver.y - turn_y
-            # The offset keeps the derivative finite where the turning point meets the receiver.
-            distance = jnp.sqrt(dx**2 + dy**2 + 1e-4)
-            bearing = jnp.arctan2(dy, dx)
-            lengths.append(
-                chord * stretch
-                + distance
-                + _detour(bearing - pose.heading - 2.0 * deviation)
-                + _detour(receiver.heading - bearing)
-                # Lining up takes a forward leg; a shorter one has to be made up for.
-                + 2.0 * jnp.maximum(FORWARD_LEG - distance, 0.0)
-            )
-    candidates = jnp.stack(lengths)
-    return -_BLEND * jax.nn.logsumexp(-candidates / _BLEND)
+        + _detour(bearing - pose.heading - 2.0 * deviation)
+        + _detour(receiver.heading - bearing)
+        # Lining up takes a forward leg; a shorter one has to be made up for.
+        + 2.0 * jnp.maximum(FORWARD_LEG - distance, 0.0)
+    )
+    return -_BLEND * jax.nn.logsumexp(-lengths / _BLEND)
+
+
+@functools.cache
+def _turning_points() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Deviation [rad], chord and arc length [m] of each candidate for the turning point."""
+    deviation, chord = (a.ravel() for a in np.meshgrid(_DEVIATION, _REVERSING))
+    chord = np.maximum(chord, 2.0 * TURNING_RADIUS * np.sin(np.abs(deviation)))
+    return deviation, chord, chord / np.sinc(deviation / np.pi)
 
 
 def _detour(angle: Array) -> Array:

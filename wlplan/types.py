@@ -20,8 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 
 @no_type_check
-@struct.dataclass
-class Pile:
+class Pile(struct.PyTreeNode):
     """Heights of a pile and the terrain around it on a square grid, world frame.
 
     Cell `[i, j]` is centred at x = origin[0] + i * cell_size, y = origin[1] + j * cell_size.
@@ -29,7 +28,7 @@ class Pile:
 
     height: Float[Array, "*batch nx ny"]  # surface [m]
     cell_size: float = struct.field(pytree_node=False)  # grid spacing [m]
-    origin: Float[Array, "*batch 2"] = (0.0, 0.0)  # centre of cell [0, 0] [m]
+    origin: Float[Array, "*batch 2"] | tuple[float, float] = (0.0, 0.0)  # centre of cell [0, 0] [m]
     ground: Float[Array, "*batch nx ny"] | None = None  # floor under the pile [m]; None: level 0
     valid: Bool[Array, "*batch nx ny"] | None = None  # cells the scan saw; None: all of them
 
@@ -46,8 +45,7 @@ class Pile:
 
 
 @no_type_check
-@struct.dataclass
-class Pose:
+class Pose(struct.PyTreeNode):
     """A dig location at the toe of the pile and the heading into the pile, world frame."""
 
     x: Float[Array, "*batch"]  # [m]
@@ -56,8 +54,7 @@ class Pose:
 
 
 @no_type_check
-@struct.dataclass
-class Action:
+class Action(struct.PyTreeNode):
     """Parameters of the automatic bucket-filling controller. Paper, section 4.2."""
 
     delta_bm: Float[Array, "*batch"]  # boom force threshold [1], 0..0.7
@@ -77,8 +74,7 @@ def action_from(vector: Float[Array, "*batch 4"]) -> Action:
 
 
 @no_type_check
-@struct.dataclass
-class Performance:
+class Performance(struct.PyTreeNode):
     """What one loading yields and costs. Paper, section 5.1."""
 
     mass: Float[Array, "*batch"]  # [tonne]
@@ -87,8 +83,7 @@ class Performance:
 
 
 @no_type_check
-@struct.dataclass
-class Characteristics:
+class Characteristics(struct.PyTreeNode):
     """The four local pile characteristics of the low-dimensional model. Paper, section 3.3."""
 
     slope: Float[Array, "*batch"]  # theta [rad]
@@ -98,8 +93,7 @@ class Characteristics:
 
 
 @no_type_check
-@struct.dataclass
-class LocalHeightmap:
+class LocalHeightmap(struct.PyTreeNode):
     """Heights in the local frame of a pose, relative to the first point of the centre line.
 
     Cell `[i, j]` lies i * cell_size - displacement along the heading and
@@ -112,8 +106,7 @@ class LocalHeightmap:
 
 
 @no_type_check
-@struct.dataclass
-class LoadingPlan:
+class LoadingPlan(struct.PyTreeNode):
     """N loadings in order; every leaf has the leading axis N."""
 
     pose: Pose
@@ -121,8 +114,7 @@ class LoadingPlan:
 
 
 @no_type_check
-@struct.dataclass
-class Rollout:
+class Rollout(struct.PyTreeNode):
     """The outcome of a plan."""
 
     performance: Performance  # per loading, leaves (N,)

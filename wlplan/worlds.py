@@ -26,8 +26,7 @@ WORLDS = ("low", "high", "hybrid", "simulator")
 
 
 @no_type_check
-@struct.dataclass
-class LowWorld:
+class LowWorld(struct.PyTreeNode):
     """The low-dimensional world: ψ_low, mass removal along the strip, automaton. Paper, 3.6."""
 
     model: PerformanceModel

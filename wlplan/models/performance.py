@@ -96,8 +96,7 @@ def soft_clamp(values: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 @no_type_check
-@struct.dataclass
-class PerformanceModel:
+class PerformanceModel(struct.PyTreeNode):
     """A trained ψ_low. A pytree: the weights and the normalisers are leaves.
 
     The weights are float32; with float64 inputs the arithmetic is in float64.

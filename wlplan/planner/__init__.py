@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import numpy as np
 
 from wlplan.errors import InputError
 from wlplan.objective import Objective, objective_named
 from wlplan.pile import ToeContour, toe_contour
 from wlplan.planner.gradient import GradientSettings, gradient
-from wlplan.planner.job import Job, Outcome, play_decisions, play_plan
+from wlplan.planner.job import Decisions, Job, Outcome, ToeJob, outcomes, played
 from wlplan.planner.search import Progress, SearchSettings, greedy, nominal
 from wlplan.planner.toe import toe_of
 from wlplan.transport import Receiver, default_receiver
@@ -29,7 +31,11 @@ __all__ = [
 PlanResult = Outcome
 """A plan and what it yields and costs in the world it was played in."""
 
-_PLANNERS = {"gradient": gradient, "greedy": greedy, "nominal": nominal}
+_PLANNERS: dict[str, Callable[..., Decisions]] = {
+    "gradient": gradient,
+    "greedy": greedy,
+    "nominal": nominal,
+}
 PLANNERS = tuple(_PLANNERS)
 """Names of the planners."""
 
@@ -43,6 +49,7 @@ def plan_loads(
     planner: str = "gradient",
     receiver: Receiver | None = None,
     seed: int = 0,
+    referee: World | None = None,
     progress: Progress | None = None,
     settings: GradientSettings | SearchSettings | None = None,
     contour: ToeContour | None = None,
@@ -57,12 +64,16 @@ def plan_loads(
         planner: One of `PLANNERS`.
         receiver: Where the loads go; default: the follow-up's place relative to the pile.
         seed: Of everything random.
+        referee: World that plays the planner's best candidates, poses as planned, and picks the
+            cheapest; a candidate that `world` finds dearer than the planner's last, for the
+            gradient planner the greedy plan, is out. None: `world` picks.
         progress: Called as the planner advances.
         settings: Of the planner; default: its own.
         contour: The toe to dig along; default: that of the pile.
 
     Returns:
-        The plan, its rollout in `world`, the transport, and the cost.
+        The plan, its rollout in `world`, the transport, the cost, and in `refereed` how the
+        referee saw it.
 
     Raises:
         InputError: If there is nothing to dig, no load is asked for, or a name is unknown.
@@ -71,10 +82,25 @@ def plan_loads(
         raise InputError(f"unknown planner {planner!r}; choose one of {', '.join(PLANNERS)}")
     if loads < 1:
         raise InputError(f"{loads} loads were asked for; ask for at least 1")
-    job = _job(world, pile, objective, receiver, contour)
+    job = ToeJob(
+        world=_as_pytree(world),
+        pile=pile,
+        toe=toe_of(toe_contour(pile) if contour is None else contour, pile.height.dtype),
+        receiver=default_receiver(pile) if receiver is None else receiver,
+        objective=objective_named(objective),
+    )
     options: dict[str, Any] = {} if settings is None else {"settings": settings}
-    decisions = _PLANNERS[planner](job, loads, seed=seed, progress=progress, **options)
-    return jax.jit(play_decisions)(job, decisions)
+    candidates = _PLANNERS[planner](job, loads, seed=seed, progress=progress, **options)
+    seen = outcomes(job, candidates)
+    costs = np.asarray(seen.cost)
+    if referee is None:
+        return _member(seen, int(np.nanargmin(costs)))
+    judge = Job(_as_pytree(referee), pile, job.receiver, job.objective)
+    judged = played(judge, seen.plan)
+    # Rounding may put a plan that is its own limit above it.
+    allowed = costs <= costs[-1] * (1.0 + 1e-6)
+    winner = int(np.nanargmin(np.where(allowed, np.asarray(judged.cost), np.inf)))
+    return _member(seen, winner).replace(refereed=_member(judged, winner))
 
 
 def play(
@@ -94,25 +120,17 @@ def play(
         objective: Name or weights.
         receiver: Where the loads go; default: the follow-up's place relative to the pile.
     """
-    return jax.jit(play_plan)(_job(world, pile, objective, receiver, None, toe=False), plan)
-
-
-def _job(
-    world: World,
-    pile: Pile,
-    objective: str | Objective,
-    receiver: Receiver | None,
-    contour: ToeContour | None,
-    *,
-    toe: bool = True,
-) -> Job:
-    return Job(
+    job = Job(
         world=_as_pytree(world),
         pile=pile,
-        toe=toe_of(contour or toe_contour(pile), pile.height.dtype) if toe else None,
         receiver=default_receiver(pile) if receiver is None else receiver,
         objective=objective_named(objective),
     )
+    return _member(played(job, jax.tree.map(lambda leaf: leaf[None], plan)), 0)
+
+
+def _member(batch: Outcome, k: int) -> Outcome:
+    return jax.tree.map(lambda leaf: leaf[k], batch)
 
 
 def _as_pytree(world: World) -> World:

@@ -11,17 +11,19 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from wlplan.planner.job import Decisions, Job, play_decisions
+from wlplan.planner.job import Decisions, ToeJob, contour_length, costs_and_gradients
 from wlplan.planner.search import Progress, SearchSettings, greedy, nominal
+
+DEFAULT_SEARCH = SearchSettings()
 
 
 @dataclasses.dataclass(frozen=True)
 class GradientSettings:
     """How hard the gradient planner works."""
 
-    # Plans that are optimised side by side: greedy, nominal, and perturbations of them.
+    # Plans that are optimised side by side: greedy, nominal, and perturbations of the first.
     starts: int = 6
-    iterations: int = 60
+    iterations: int = 48
     # Largest step of an iteration: along the contour [m], heading offset and action before
     # squashing.
     step_position: float = 0.12
@@ -31,17 +33,11 @@ class GradientSettings:
     spread_position: float = 1.5
     spread_offset: float = 0.3
     spread_action: float = 0.5
-    search: SearchSettings = SearchSettings()
-
-
-@jax.jit
-def _values_and_gradients(job: Job, starts: Decisions):
-    """Cost and gradient of each start; leaves [S, N]."""
-
-    def cost(decisions: Decisions) -> Array:
-        return play_decisions(job, decisions).cost
-
-    return jax.vmap(jax.value_and_grad(cost))(starts)
+    # How many plans are handed on for a referee to choose from, and how often one is taken from
+    # each start as the iterations go.
+    candidates: int = 16
+    snapshot_every: int = 8
+    search: SearchSettings = DEFAULT_SEARCH
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
@@ -70,16 +66,14 @@ def _optimiser(settings: GradientSettings) -> optax.GradientTransformation:
 
 
 def gradient(
-    job: Job,
+    job: ToeJob,
     loads: int,
     *,
     seed: int,
     settings: GradientSettings = GradientSettings(),
     progress: Progress | None = None,
 ) -> Decisions:
-    """The cheapest plan that Adam finds from greedy, nominal and perturbed starts.
-
-    Every plan that is visited counts, so the result costs at most what the greedy plan does.
+    """The cheapest plans that Adam finds from greedy, nominal and perturbed starts.
 
     Args:
         job: Pile, world and objective; the world must be differentiable.
@@ -87,46 +81,49 @@ def gradient(
         seed: Of the starts.
         settings: How hard to work.
         progress: Called after each iteration with the best cost so far.
+
+    Returns:
+        Up to `settings.candidates` plans, leaves [K, N], in the order of their cost. The greedy
+        plan is a start and every visited plan counts, so the first costs at most what greedy does;
+        the last is the greedy plan itself.
     """
-    first = [
-        greedy(job, loads, seed=seed, settings=settings.search, progress=progress),
-        nominal(job, loads, seed=seed, settings=settings.search, progress=progress),
-    ][: settings.starts]
-    length = _contour_length(job)
+    search = dataclasses.replace(settings.search, rows=settings.starts)
+    base = greedy(job, loads, seed=seed, settings=search, progress=progress)
+    even = nominal(job, loads, seed=seed, settings=search, progress=progress)
+    length = contour_length(job)
     rng = np.random.default_rng([seed, 1])
-    starts = first + [
-        _perturbed(first[k % len(first)], length, rng, settings)
-        for k in range(settings.starts - len(first))
-    ]
-    decisions = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+    rows = [base, even, *(_perturbed(base, length, rng, settings) for _ in range(settings.starts))]
+    decisions = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: settings.starts], *rows)
     state = _optimiser(settings).init(decisions)
-    best, best_cost = first[0], np.inf
+    # Snapshots for the referee, and each start's best.
+    kept: list[tuple[float, Decisions]] = []
+    best_costs = np.full(settings.starts, np.inf)
+    best: list[Decisions] = [base] * settings.starts
     for k in range(settings.iterations + 1):
-        costs, gradients = _values_and_gradients(job, decisions)
+        costs, gradients = costs_and_gradients(job, decisions)
         costs = np.asarray(costs)
-        winner = int(np.nanargmin(costs))
-        if costs[winner] < best_cost:
-            best_cost = float(costs[winner])
-            best = jax.tree.map(lambda leaf, w=winner: leaf[w], decisions)
+        for row in np.flatnonzero(costs < best_costs):
+            best_costs[row] = costs[row]
+            best[row] = jax.tree.map(lambda leaf, r=row: leaf[r : r + 1], decisions)
+        if k % settings.snapshot_every == 0:
+            kept += [
+                (float(costs[r]), jax.tree.map(lambda leaf, r=r: leaf[r : r + 1], decisions))
+                for r in np.flatnonzero(np.isfinite(costs))
+            ]
         if progress is not None:
-            progress("gradient", k, settings.iterations, best_cost)
+            progress("gradient", k, settings.iterations, float(best_costs.min()))
         if k < settings.iterations:
-            decisions, state = _update(
-                gradients, state, decisions, jnp.asarray(length, costs.dtype), settings=settings
-            )
-    return best
-
-
-def _contour_length(job: Job) -> float:
-    points = np.asarray(job.toe.points)
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+            decisions, state = _update(gradients, state, decisions, length, settings=settings)
+    pool = sorted([*zip(best_costs.tolist(), best, strict=True), *kept], key=lambda pair: pair[0])
+    chosen = [plan for _, plan in pool[: settings.candidates - 1]]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *chosen, base)
 
 
 def _perturbed(
-    plan: Decisions, length: float, rng: np.random.Generator, settings: GradientSettings
+    plan: Decisions, length: Array, rng: np.random.Generator, settings: GradientSettings
 ) -> Decisions:
-    def shaken(leaf: Array, spread: float) -> Array:
-        return leaf + jnp.asarray(spread * rng.normal(size=leaf.shape), leaf.dtype)
+    def shaken(leaf: Array, spread: float | Array) -> Array:
+        return leaf + spread * jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype)
 
     return Decisions(
         position=shaken(plan.position, settings.spread_position / length),

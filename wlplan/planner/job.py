@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import no_type_check
 
 import jax
@@ -10,29 +11,34 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+from wlplan.compilation import jit_small_loops
+from wlplan.horizon import closed_loop
 from wlplan.objective import Objective, loading_cost
 from wlplan.planner.toe import Toe, pose_at
-from wlplan.horizon import closed_loop
 from wlplan.transport import Receiver, transport
-from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose, Rollout, World, action_from
+from wlplan.types import Action, LoadingPlan, Pile, Pose, Rollout, World, action_from
 from wlplan.units import ACTION_HIGH, ACTION_LOW
 
 
 @no_type_check
-@struct.dataclass
-class Job:
+class Job(struct.PyTreeNode):
     """A pile to load from, and for what."""
 
     world: World
     pile: Pile
-    toe: Toe
     receiver: Receiver
     objective: Objective = struct.field(pytree_node=False)
 
 
 @no_type_check
-@struct.dataclass
-class Decisions:
+class ToeJob(Job):
+    """A job whose loadings are decided along the toe of the pile."""
+
+    toe: Toe = struct.field(kw_only=True)
+
+
+@no_type_check
+class Decisions(struct.PyTreeNode):
     """What a planner chooses of loadings; unbounded, so that any value is a plan."""
 
     position: Float[Array, "*n"]  # along the toe contour, in parts of its length
@@ -41,37 +47,35 @@ class Decisions:
 
 
 @no_type_check
-@struct.dataclass
-class Outcome:
+class Outcome(struct.PyTreeNode):
     """A played plan."""
 
     plan: LoadingPlan  # leaves (N,)
     rollout: Rollout
-    transport_time: Float[Array, "n"]  # [s]
-    transport_work: Float[Array, "n"]  # [kJ]
-    costs: Float[Array, "n"]  # of the loadings
+    transport_time: Float[Array, " n"]  # [s]
+    transport_work: Float[Array, " n"]  # [kJ]
+    costs: Float[Array, " n"]  # of the loadings
     cost: Float[Array, ""]  # their sum
+    refereed: Outcome | None = None  # the same plan played by the referee, if there was one
 
 
 _LOW = np.asarray(ACTION_LOW)
 _RANGE = np.asarray(ACTION_HIGH) - _LOW
 
 
-def squash(raw: Float[Array, "*n 4"]) -> Action:
+def squash(raw: Float[Array, "4"]) -> Action:
     """Action inside its box."""
     low, span = jnp.asarray(_LOW, raw.dtype), jnp.asarray(_RANGE, raw.dtype)
-    return action_from(low.reshape((1,) * (raw.ndim - 1) + (4,)) + jax.nn.sigmoid(raw) * (
-        span.reshape((1,) * (raw.ndim - 1) + (4,))
-    ))
+    return action_from(low + jax.nn.sigmoid(raw) * span)
 
 
-def unsquash(vector: np.ndarray) -> np.ndarray:
-    """Inverse of `squash` for vectors; the edges of the box are moved in by a hundredth."""
-    part = np.clip((vector - _LOW) / _RANGE, 0.01, 0.99)
+def unsquash(part: Float[np.ndarray, "*n 4"]) -> Float[np.ndarray, "*n 4"]:
+    """Inverse of `squash` for parts of the box; its edges are moved in by a hundredth."""
+    part = np.clip(part, 0.01, 0.99)
     return np.log(part / (1.0 - part))
 
 
-def decide(job: Job, pile: Pile, decisions: Decisions) -> tuple[Pose, Action]:
+def decide(job: ToeJob, pile: Pile, decisions: Decisions) -> tuple[Pose, Action]:
     """Pose and action of one loading on the pile as it is."""
     return pose_at(job.toe, pile, decisions.position, decisions.offset), squash(decisions.action)
 
@@ -91,7 +95,7 @@ def _judged(job: Job, plan: LoadingPlan, outcome: Rollout) -> Outcome:
     )
 
 
-def play_decisions(job: Job, decisions: Decisions) -> Outcome:
+def play_decisions(job: ToeJob, decisions: Decisions) -> Outcome:
     """Plays decisions, leaves with leading axis N, each on the pile that the ones before left."""
     outcome, plan = closed_loop(
         job.world, job.pile, decisions, lambda pile, d: decide(job, pile, d)
@@ -107,7 +111,7 @@ def play_plan(job: Job, plan: LoadingPlan) -> Outcome:
     return _judged(job, plan, outcome)
 
 
-def cost_of_one(job: Job, pile: Pile, decisions: Decisions) -> Float[Array, ""]:
+def cost_of_one(job: ToeJob, pile: Pile, decisions: Decisions) -> Float[Array, ""]:
     """Cost of a single loading on a given pile; what becomes of the pile is not computed."""
     pose, action = decide(job, pile, decisions)
     _, performance = job.world(pile, pose, action)
@@ -115,10 +119,35 @@ def cost_of_one(job: Job, pile: Pile, decisions: Decisions) -> Float[Array, ""]:
     return loading_cost(job.objective, performance, time, work)
 
 
-def load_once(
-    job: Job, pile: Pile, decisions: Decisions
-) -> tuple[Pile, Performance, Pose, Action]:
-    """One loading."""
-    pose, action = decide(job, pile, decisions)
-    pile, performance = job.world(pile, pose, action)
-    return pile, performance, pose, action
+def contour_length(job: ToeJob) -> Float[Array, ""]:
+    """Length of the toe contour [m]."""
+    steps = job.toe.points[1:] - job.toe.points[:-1]
+    return jnp.sqrt((steps**2).sum(axis=1)).sum()
+
+
+def stacked(decisions: Sequence[Decisions]) -> Decisions:
+    """Several decisions as one, with a new leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *decisions)
+
+
+@jax.jit
+def outcomes(job: ToeJob, plans: Decisions) -> Outcome:
+    """Plays several plans; leaves [K, N]."""
+    return jax.vmap(lambda decisions: play_decisions(job, decisions))(plans)
+
+
+@jax.jit
+def played(job: Job, plans: LoadingPlan) -> Outcome:
+    """Plays several fixed plans; leaves [K, N]."""
+    return jax.vmap(lambda plan: play_plan(job, plan))(plans)
+
+
+def _costs_and_gradients(job: ToeJob, plans: Decisions) -> tuple[Float[Array, " k"], Decisions]:
+    def cost(decisions: Decisions) -> Array:
+        return play_decisions(job, decisions).cost
+
+    return jax.vmap(jax.value_and_grad(cost))(plans)
+
+
+costs_and_gradients = jit_small_loops(_costs_and_gradients)
+"""Cost of several plans, leaves [K, N], and its gradient."""

@@ -16,9 +16,20 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from wlplan.planner.job import Decisions, Job, cost_of_one, load_once, play_decisions, unsquash
+from wlplan.compilation import jit_small_loops
+from wlplan.planner.job import (
+    Decisions,
+    ToeJob,
+    contour_length,
+    cost_of_one,
+    costs_and_gradients,
+    decide,
+    outcomes,
+    stacked,
+    unsquash,
+)
+from wlplan.sampling import latin_hypercube
 from wlplan.types import Pile
-from wlplan.units import ACTION_HIGH, ACTION_LOW
 
 Progress = Callable[[str, int, int, float | None], None]
 """`progress(stage, done, total, cost)`, called as a planner advances."""
@@ -32,48 +43,40 @@ class SearchSettings:
     poses_per_metre: float = 1.5
     offsets: tuple[float, ...] = (-0.6, 0.0, 0.6)
     actions: int = 24
-    # The best candidates are refined by this many steps of Adam; 0 for worlds without gradient.
-    refined: int = 8
+    # Steps of Adam that refine the best candidates; 0 for worlds without a gradient.
     refine_steps: int = 30
     refine_rate: float = 0.08
+    # The greedy planner refines this many candidates, each at a pose of its own.
+    refined: int = 8
+    # The nominal planner plays this many plans side by side.
+    rows: int = 6
     # Candidates that are evaluated at once: bounds the memory.
     batch: int = 256
 
 
-def latin_hypercube(n: int, rng: np.random.Generator) -> np.ndarray:
-    """n actions that fill the box evenly, one in each n-th of every parameter, shape [n, 4]."""
-    cells = np.stack([rng.permutation(n) for _ in ACTION_LOW], axis=1)
-    part = (cells + rng.random(cells.shape)) / n
-    low, high = np.asarray(ACTION_LOW), np.asarray(ACTION_HIGH)
-    return low + part * (high - low)
-
-
-def _contour_length(job: Job) -> float:
-    points = np.asarray(job.toe.points)
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+def _spread_actions(n: int, rng: np.random.Generator, dtype: np.dtype) -> Float[Array, "n 4"]:
+    """Actions, before squashing, that fill the box evenly."""
+    return jnp.asarray(unsquash(latin_hypercube(n, 4, rng)), dtype)
 
 
 @functools.partial(jax.jit, static_argnames="batch")
 def _candidate_costs(
-    job: Job, pile: Pile, poses: Decisions, actions: Float[Array, "a 4"], *, batch: int
+    job: ToeJob, pile: Pile, poses: Decisions, actions: Float[Array, "a 4"], *, batch: int
 ) -> Float[Array, "p a"]:
     """Cost of every action at every pose; what depends on the pose alone is computed once."""
 
     def at_pose(pose: Decisions) -> Array:
-        return jax.vmap(
-            lambda action: cost_of_one(job, pile, pose.replace(action=action))
-        )(actions)
+        return jax.vmap(lambda action: cost_of_one(job, pile, pose.replace(action=action)))(actions)
 
     return jax.lax.map(at_pose, poses, batch_size=max(1, batch // actions.shape[0]))
 
 
-@functools.partial(jax.jit, static_argnames=("steps", "rate"))
-def _refine(
-    job: Job, pile: Pile, starts: Decisions, *, steps: int, rate: float
-) -> tuple[Decisions, Float[Array, "k"]]:
+def _refine_starts(
+    job: ToeJob, pile: Pile, starts: Decisions, *, steps: int, rate: float
+) -> tuple[Decisions, Float[Array, " k"]]:
     """Adam on single loadings, from several starts; returns the best visited of each."""
     optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps))
-    length = _length_of(job)
+    length = contour_length(job)
 
     def cost(variables: Decisions) -> Array:
         # Metres along the contour, so that one rate suits all variables.
@@ -91,27 +94,22 @@ def _refine(
 
         first = start.replace(position=start.position * length)
         carry = (first, optimiser.init(first), first, jnp.full((), jnp.inf, length.dtype))
-        (last, _, best, best_cost), _ = jax.lax.scan(step, carry, None, length=steps)
-        value = cost(last)
-        best = jax.tree.map(lambda b, v: jnp.where(value < best_cost, v, b), best, last)
-        return best.replace(position=best.position / length), jnp.minimum(value, best_cost)
+        (_, _, best, best_cost), _ = jax.lax.scan(step, carry, None, length=steps)
+        return best.replace(position=best.position / length), best_cost
 
     return jax.vmap(one)(starts)
 
 
-def _length_of(job: Job) -> Float[Array, ""]:
-    """Length of the toe contour [m]."""
-    steps = job.toe.points[1:] - job.toe.points[:-1]
-    return jnp.sqrt((steps**2).sum(axis=1)).sum()
+_refine = jit_small_loops(_refine_starts, static_argnames=("steps", "rate"))
 
 
 @jax.jit
-def _advance(job: Job, pile: Pile, decisions: Decisions) -> Pile:
-    return load_once(job, pile, decisions)[0]
+def _advance(job: ToeJob, pile: Pile, decisions: Decisions) -> Pile:
+    return job.world(pile, *decide(job, pile, decisions))[0]
 
 
 def greedy(
-    job: Job,
+    job: ToeJob,
     loads: int,
     *,
     seed: int,
@@ -123,37 +121,37 @@ def greedy(
     Args:
         job: Pile, world and objective.
         loads: Number of loadings.
-        seed: Of the actions that are tried.
+        seed: Of the poses and actions that are tried.
         settings: How hard to search.
-        progress: Called after each loading.
+        progress: Called after each loading with its cost.
+
+    Returns:
+        One plan, leaves [1, N].
     """
     rng = np.random.default_rng(seed)
     dtype = job.pile.height.dtype
-    count = max(8, round(settings.poses_per_metre * _contour_length(job)))
+    count = max(8, round(settings.poses_per_metre * float(contour_length(job))))
     pile, chosen = job.pile, []
     for load in range(loads):
-        # A fresh offset a loading, so that poses are not tied to one raster.
+        # A fresh shift a loading, so that poses are not tied to one raster.
         positions = (np.arange(count) + rng.random()) / count
         grid = np.stack(np.meshgrid(positions, settings.offsets, indexing="ij"), -1).reshape(-1, 2)
-        actions = jnp.asarray(unsquash(latin_hypercube(settings.actions, rng)), dtype)
+        actions = _spread_actions(settings.actions, rng, dtype)
         poses = Decisions(
             position=jnp.asarray(grid[:, 0], dtype),
             offset=jnp.asarray(grid[:, 1], dtype),
             action=jnp.zeros((len(grid), 4), dtype),
         )
-        costs = np.asarray(
-            _candidate_costs(job, pile, poses, actions, batch=settings.batch)
-        )
+        costs = np.asarray(_candidate_costs(job, pile, poses, actions, batch=settings.batch))
         # One start a pose, so that refinement does not begin in the same place eight times.
-        best_action = costs.argmin(axis=1)
-        best_poses = np.argsort(costs.min(axis=1))[: max(settings.refined, 1)]
+        best_poses = np.argsort(costs.min(axis=1))[: settings.refined]
         starts = Decisions(
             position=poses.position[best_poses],
             offset=poses.offset[best_poses],
-            action=actions[best_action[best_poses]],
+            action=actions[costs.argmin(axis=1)[best_poses]],
         )
         values = costs.min(axis=1)[best_poses]
-        if settings.refined:
+        if settings.refine_steps:
             starts, refined = _refine(
                 job, pile, starts, steps=settings.refine_steps, rate=settings.refine_rate
             )
@@ -164,33 +162,23 @@ def greedy(
         chosen.append(decision)
         if progress is not None:
             progress("greedy", load + 1, loads, float(values[best]))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *chosen)
+    return jax.tree.map(lambda leaf: leaf[None], stacked(chosen))
 
 
-def evenly_spread(job: Job, loads: int, action: Float[Array, "4"]) -> Decisions:
-    """Poses at equal distances around the toe, square to it, with one action."""
+def evenly_spread(job: ToeJob, loads: int, actions: Float[Array, "k 4"]) -> Decisions:
+    """Poses at equal distances around the toe, square to it, one action a plan; leaves [K, N]."""
     dtype = job.pile.height.dtype
+    shape = (actions.shape[0], loads)
+    position = (jnp.arange(loads, dtype=dtype) + 0.5) / loads
     return Decisions(
-        position=(jnp.arange(loads, dtype=dtype) + 0.5) / loads,
-        offset=jnp.zeros(loads, dtype),
-        action=jnp.broadcast_to(action[None, :], (loads, 4)),
+        position=jnp.broadcast_to(position[None, :], shape),
+        offset=jnp.zeros(shape, dtype),
+        action=jnp.broadcast_to(actions[:, None, :], (*shape, 4)),
     )
 
 
-@functools.partial(jax.jit, static_argnames=("loads",))
-def _nominal_cost(job: Job, action: Float[Array, "4"], *, loads: int) -> Float[Array, ""]:
-    return play_decisions(job, evenly_spread(job, loads, action)).cost
-
-
-@functools.partial(jax.jit, static_argnames=("loads",))
-def _nominal_gradient(job: Job, action: Float[Array, "4"], *, loads: int):
-    return jax.value_and_grad(
-        lambda a: play_decisions(job, evenly_spread(job, loads, a)).cost
-    )(action)
-
-
 def nominal(
-    job: Job,
+    job: ToeJob,
     loads: int,
     *,
     seed: int,
@@ -199,7 +187,7 @@ def nominal(
 ) -> Decisions:
     """One fixed action at evenly spread poses, the action tuned on this pile.
 
-    The action is the best of a Latin hypercube over whole plans, refined by Adam.
+    The best actions of a Latin hypercube, each judged by its whole plan, are refined by Adam.
 
     Args:
         job: Pile, world and objective.
@@ -207,27 +195,42 @@ def nominal(
         seed: Of the actions that are tried.
         settings: How hard to search.
         progress: Called as the tuning advances.
+
+    Returns:
+        One plan, leaves [1, N].
     """
     dtype = job.pile.height.dtype
     rng = np.random.default_rng(seed)
-    trials = jnp.asarray(unsquash(latin_hypercube(settings.actions, rng)), dtype)
-    total = len(trials) + settings.refine_steps
-    best, best_cost = trials[0], np.inf
-    for k, trial in enumerate(trials):
-        cost = float(_nominal_cost(job, trial, loads=loads))
-        if cost < best_cost:
-            best, best_cost = trial, cost
+    rows = settings.rows
+    batches = -(-settings.actions // rows)
+    trials = _spread_actions(rows * batches, rng, dtype)
+    total = batches + settings.refine_steps
+
+    def costs_of(actions: Array) -> tuple[np.ndarray, Array]:
+        plans = evenly_spread(job, loads, actions)
+        if not settings.refine_steps:
+            return np.asarray(outcomes(job, plans).cost), jnp.zeros_like(actions)
+        costs, gradients = costs_and_gradients(job, plans)
+        # All loadings share the action.
+        return np.asarray(costs), gradients.action.sum(axis=1)
+
+    tried = []
+    for k in range(batches):
+        tried.append(costs_of(trials[k * rows : (k + 1) * rows])[0])
         if progress is not None:
-            progress("nominal", k + 1, total, best_cost)
-    if settings.refined:
-        optimiser = optax.adam(2.0 * settings.refine_rate)
-        action, state = best, optimiser.init(best)
-        for k in range(settings.refine_steps):
-            cost, gradient = _nominal_gradient(job, action, loads=loads)
-            if float(cost) < best_cost:
-                best, best_cost = action, float(cost)
-            updates, state = optimiser.update(gradient, state)
-            action = optax.apply_updates(action, updates)
-            if progress is not None:
-                progress("nominal", len(trials) + k + 1, total, best_cost)
-    return evenly_spread(job, loads, best)
+            progress("nominal", k + 1, total, float(np.nanmin(np.concatenate(tried))))
+    order = np.argsort(np.concatenate(tried))
+    best, best_cost = trials[order[0]], float(np.concatenate(tried)[order[0]])
+    actions = trials[order[:rows]]
+    optimiser = optax.adam(2.0 * settings.refine_rate)
+    state = optimiser.init(actions)
+    for k in range(settings.refine_steps):
+        costs, gradient = costs_of(actions)
+        winner = int(np.nanargmin(costs))
+        if costs[winner] < best_cost:
+            best, best_cost = actions[winner], float(costs[winner])
+        updates, state = optimiser.update(gradient, state)
+        actions = optax.apply_updates(actions, updates)
+        if progress is not None:
+            progress("nominal", batches + k + 1, total, best_cost)
+    return evenly_spread(job, loads, best[None, :])

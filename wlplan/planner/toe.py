@@ -28,13 +28,14 @@ TOE_RISE = 0.15
 
 # The pile may have bulged out over its old toe, and may have been taken back this far [m].
 _FROM, _TO, _STEP = -2.0, 9.0, 0.1
+# Neighbouring points further apart than this are not neighbours on the contour [m].
+_GAP = 0.5
 # The toe is where the mean over these lines across the bucket rises [m].
 _ACROSS = (-0.9, -0.45, 0.0, 0.45, 0.9)
 
 
 @no_type_check
-@struct.dataclass
-class Toe:
+class Toe(struct.PyTreeNode):
     """A toe contour as arrays, for use inside jitted functions."""
 
     points: Float[Array, "n 2"]  # [m]
@@ -43,18 +44,30 @@ class Toe:
 
 
 def toe_of(contour: ToeContour, dtype: np.dtype | type = np.float32) -> Toe:
-    """The arrays of a contour; spacing as in the contour."""
-    heading = np.asarray(contour.heading)
+    """The arrays of a contour; only where it is accessible.
+
+    If part of it is not, the rest is an open path that begins after the longest gap; positions in
+    the other gaps go to the nearer side.
+    """
+    accessible = np.asarray(contour.accessible)
+    points, heading = np.asarray(contour.points), np.asarray(contour.heading)
+    closed = bool(contour.closed) and bool(accessible.all())
+    if not closed and contour.closed:
+        # Start behind the longest run of inaccessible points, wherever the numbering began.
+        reachable = np.flatnonzero(accessible)
+        gaps = np.diff(np.append(reachable, reachable[0] + len(points)))
+        first = reachable[(gaps.argmax() + 1) % len(reachable)]
+        order = np.roll(np.arange(len(points)), -first)
+        points, heading, accessible = points[order], heading[order], accessible[order]
+    points, heading = points[accessible], heading[accessible]
     return Toe(
-        points=jnp.asarray(contour.points, dtype),
+        points=jnp.asarray(points, dtype),
         direction=jnp.asarray(np.stack([np.cos(heading), np.sin(heading)], axis=1), dtype),
-        closed=bool(contour.closed),
+        closed=closed,
     )
 
 
-def pose_at(
-    toe: Toe, pile: Pile, position: Float[Array, ""], offset: Float[Array, ""]
-) -> Pose:
+def pose_at(toe: Toe, pile: Pile, position: Float[Array, ""], offset: Float[Array, ""]) -> Pose:
     """The pose at the current toe of a pile.
 
     Args:
@@ -70,7 +83,9 @@ def pose_at(
         index = jnp.clip(position, 0.0, 1.0) * (n - 1)
     low = jnp.clip(jnp.floor(lax.stop_gradient(index)).astype(jnp.int32), 0, n - 1)
     high = (low + 1) % n if toe.closed else jnp.minimum(low + 1, n - 1)
-    part = index - low
+    # Across a gap in the contour there is nothing to interpolate.
+    gap = jnp.abs(toe.points[high] - toe.points[low]).max() > _GAP
+    part = jnp.where(gap, jnp.round(index - low), index - low)
     point = (1.0 - part) * toe.points[low] + part * toe.points[high]
     into = (1.0 - part) * toe.direction[low] + part * toe.direction[high]
     heading = jnp.arctan2(into[1], into[0]) + MAX_OFFSET * jnp.tanh(offset)
@@ -95,6 +110,8 @@ def distance_to_toe(pile: Pile, pose: Pose) -> Float[Array, ""]:
     before = jnp.maximum(first - 1, 0)
     climb = rise[first] - rise[before]
     # Between the last point below the level and the first above it, by interpolation.
-    part = jnp.where(climb > 0.0, (TOE_RISE - rise[before]) / jnp.where(climb > 0.0, climb, 1.0), 0.0)
+    part = jnp.where(
+        climb > 0.0, (TOE_RISE - rise[before]) / jnp.where(climb > 0.0, climb, 1.0), 0.0
+    )
     distance = along[before] + _STEP * jnp.clip(part, 0.0, 1.0)
     return jnp.where(reached.any(), distance, 0.0)

@@ -54,8 +54,7 @@ class Settings:
 
 
 @no_type_check
-@struct.dataclass
-class Cycle:
+class Cycle(struct.PyTreeNode):
     """The outcome of one loading cycle, SI units."""
 
     mass: Float[Array, ""]  # load [kg]
@@ -72,8 +71,7 @@ class Cycle:
 
 
 @no_type_check
-@struct.dataclass
-class State:
+class State(struct.PyTreeNode):
     """What the time stepping carries."""
 
     height: Float[Array, "52 52"]

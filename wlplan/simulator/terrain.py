@@ -65,7 +65,7 @@ def _hat(centre: Array, half_width: float, dtype: np.dtype) -> Array:
     return weight / jnp.maximum(weight.sum(), 1e-6)
 
 
-def fullness(machine: WheelLoader, fill: Float[Array, "n"]) -> Float[Array, "n"]:
+def fullness(machine: WheelLoader, fill: Float[Array, " n"]) -> Float[Array, " n"]:
     """Fill of each lane over what the heaped bucket holds there [1]."""
     width = jnp.asarray(lane_widths(machine), fill.dtype)
     heaped = machine.bucket_heaped / machine.bucket_width
@@ -77,7 +77,7 @@ def reaction(
     machine: WheelLoader,
     soil: Soil,
     height: Float[Array, "n n"],
-    fill: Float[Array, "n"],
+    fill: Float[Array, " n"],
     bucket: Bucket,
 ) -> Reaction:
     """Resistance that the soil would put up against the bucket moving forward.
@@ -123,12 +123,12 @@ def move(
     machine: WheelLoader,
     soil: Soil,
     height: Float[Array, "n n"],
-    fill: Float[Array, "n"],
+    fill: Float[Array, " n"],
     ground: Float[Array, "n n"],
     bucket: Bucket,
     reach: tuple[Float[Array, ""], Float[Array, ""]],
     step: float,
-) -> tuple[Float[Array, "n n"], Float[Array, "n"]]:
+) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """Heightfield and fill after one time step of bucket motion.
 
     Args:

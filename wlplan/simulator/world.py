@@ -24,8 +24,7 @@ from wlplan.units import J_PER_KJ, KG_PER_TONNE
 
 
 @no_type_check
-@struct.dataclass
-class Simulator:
+class Simulator(struct.PyTreeNode):
     """A World that plays the loading cycle; all fields are static."""
 
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
@@ -38,9 +37,7 @@ class Simulator:
         after, performance, _ = self.play(pile, pose, action)
         return after, performance
 
-    def play(
-        self, pile: Pile, pose: Pose, action: Action
-    ) -> tuple[Pile, Performance, Cycle]:
+    def play(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance, Cycle]:
         """One loading with its record.
 
         The loader stands on the floor at the dig location, level; a floor that rises into the
@@ -56,7 +53,9 @@ class Simulator:
             the record of the cycle in SI units.
         """
         window, start = window_of(pile, pose)
-        axes = (jnp.asarray(a, pile.height.dtype) for a in local_axes(STATE_CELLS, STATE_DISPLACEMENT))
+        axes = (
+            jnp.asarray(a, pile.height.dtype) for a in local_axes(STATE_CELLS, STATE_DISPLACEMENT)
+        )
         points = to_world(pose, *jnp.meshgrid(*axes, indexing="ij"))
         floor = jnp.zeros_like(window.height) if window.ground is None else window.ground
         level = sample(floor, window, pose.x, pose.y)

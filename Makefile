@@ -1,0 +1,58 @@
+# make demo      plan ten loads from the bundled pile and draw them, in demo/
+# make test      the tests that take minutes at most
+# make test-slow the rest of them
+# make lint      style and types
+#
+# Needs Python 3.11 or newer and make; everything else goes into .venv.
+# PYTHON=python3.12 make demo   chooses another interpreter for a new .venv.
+
+PYTHON ?= python3
+LOADS ?= 10
+
+VENV := .venv
+BIN := $(VENV)/bin
+# What has to be installed anew when it changes.
+PINS := pyproject.toml constraints.txt
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
+
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-slow lint clean
+
+help:
+	@sed -n 's/^# \(make .*\)/\1/p' Makefile
+
+$(VENV)/.created:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "error: $(PYTHON) is missing or older than 3.11: name one with PYTHON=..." >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.package: $(VENV)/.created $(PINS)
+	@echo "Installing wlplan into $(VENV): a few minutes when it is new."
+	$(PIP) -e .
+	@touch $@
+
+# With the extras the package itself is there too.
+$(VENV)/.tools: $(VENV)/.created $(PINS)
+	@echo "Installing wlplan and its test tools into $(VENV): a few minutes when it is new."
+	$(PIP) -e '.[scan,dev]'
+	@touch $(VENV)/.package $@
+
+demo: $(VENV)/.package
+	$(BIN)/wlplan plan --loads $(LOADS) --out demo
+	@echo "pictures: demo/plan.png and demo/totals.png; both and all numbers: demo/report.html"
+
+test: $(VENV)/.tools
+	$(BIN)/python -m pytest
+
+# Exit code 5: no test carries the marker.
+test-slow: $(VENV)/.tools
+	$(BIN)/python -m pytest -m slow || { code=$$?; test $$code -eq 5 && echo "there is no slow test"; }
+
+lint: $(VENV)/.tools
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
