@@ -263,6 +263,12 @@ def wlplan(context: click.Context) -> None:
         show_default=True,
         help="What for.",
     ),
+    click.option(
+        "--referee/--no-referee",
+        default=True,
+        show_default=True,
+        help="Let the simulator pick among the planner's best plans.",
+    ),
     _truck_option,
     _model_option,
     _out_option,
@@ -273,6 +279,7 @@ def plan(
     world_name: str,
     planner: str,
     objective: str,
+    referee: bool,
     truck: tuple[float, ...] | None,
     model: str | None,
     out: str | None,
@@ -292,7 +299,7 @@ def plan(
 
     pile, source = _read_pile(pile_file)
     receiver = _receiver(pile, truck)
-    world = _load_world(world_name, model)
+    world, simulator = _load_world(world_name, model), _load_world("simulator", None)
     with _Progress() as progress:
         with _Stopwatch() as planning:
             planned = _ready(
@@ -304,13 +311,15 @@ def plan(
                     planner=planner,
                     receiver=receiver,
                     seed=seed,
+                    referee=simulator if referee and world_name != "simulator" else None,
                     progress=progress,
                 )
             )
         with _Stopwatch() as playing:
-            simulator = _load_world("simulator", None)
             if world_name == "simulator":
                 simulated = planned
+            elif planned.refereed is not None:
+                simulated = planned.refereed
             else:
                 progress("simulator", 0, 1, None)
                 simulated = _ready(
@@ -327,6 +336,7 @@ def plan(
         world=world_name,
         planner=planner,
         objective=objective,
+        referee=referee,
         seed=seed,
         **({} if model is None else {"model": model}),
         receiver=_receiver_fields(receiver),
@@ -341,7 +351,9 @@ def plan(
         ledger=_ledger(pile, simulated, simulator),
     )
     text = _json_text(document)
-    seconds = {"planning": planning.text(), "simulator": playing.text()}
+    seconds = {"planning": planning.text()}
+    if planned.refereed is None:
+        seconds["simulator"] = playing.text()
     if folder is not None:
         _write_plan(folder, document, pile, planned, simulated, receiver, seconds)
     _remark_on_ledger(document["ledger"])
@@ -349,7 +361,7 @@ def plan(
         click.echo(text)
         return
     _print_plan(document)
-    print(f"planning {seconds['planning']}; simulator {seconds['simulator']}")
+    print("; ".join(f"{name} {text}" for name, text in seconds.items()))
     if folder is None:
         print("nothing written: --out DIR writes the plan, the figures and a report")
     else:

@@ -15,6 +15,7 @@ from wlplan.planner.gradient import GradientSettings, gradient
 from wlplan.planner.job import Decisions, Job, Outcome, ToeJob, outcomes, played
 from wlplan.planner.search import Progress, SearchSettings, greedy, nominal
 from wlplan.planner.toe import toe_of
+from wlplan.simulator import Simulator
 from wlplan.transport import Receiver, default_receiver
 from wlplan.types import LoadingPlan, Pile, World
 
@@ -38,6 +39,10 @@ _PLANNERS: dict[str, Callable[..., Decisions]] = {
 }
 PLANNERS = tuple(_PLANNERS)
 """Names of the planners."""
+
+
+WITHOUT_GRADIENT = SearchSettings(poses_per_metre=1.0, actions=16, refine_steps=0)
+"""How the baselines search in the simulator: by trial alone."""
 
 
 def plan_loads(
@@ -68,7 +73,7 @@ def plan_loads(
             cheapest; a candidate that `world` finds dearer than the planner's last, for the
             gradient planner the greedy plan, is out. None: `world` picks.
         progress: Called as the planner advances.
-        settings: Of the planner; default: its own.
+        settings: Of the planner; default: its own, or `WITHOUT_GRADIENT` in the simulator.
         contour: The toe to dig along; default: that of the pile.
 
     Returns:
@@ -76,7 +81,8 @@ def plan_loads(
         referee saw it.
 
     Raises:
-        InputError: If there is nothing to dig, no load is asked for, or a name is unknown.
+        InputError: If there is nothing to dig, no load is asked for, a name is unknown, or the
+            planner needs a gradient that the world does not have.
     """
     if planner not in _PLANNERS:
         raise InputError(f"unknown planner {planner!r}; choose one of {', '.join(PLANNERS)}")
@@ -89,6 +95,13 @@ def plan_loads(
         receiver=default_receiver(pile) if receiver is None else receiver,
         objective=objective_named(objective),
     )
+    if _has_no_gradient(world):
+        if planner == "gradient":
+            raise InputError(
+                "the simulator world plays without derivatives, which the gradient planner needs; "
+                "plan in a model, or use the greedy or the nominal planner"
+            )
+        settings = WITHOUT_GRADIENT if settings is None else settings
     options: dict[str, Any] = {} if settings is None else {"settings": settings}
     candidates = _PLANNERS[planner](job, loads, seed=seed, progress=progress, **options)
     seen = outcomes(job, candidates)
@@ -127,6 +140,10 @@ def play(
         objective=objective_named(objective),
     )
     return _member(played(job, jax.tree.map(lambda leaf: leaf[None], plan)), 0)
+
+
+def _has_no_gradient(world: World) -> bool:
+    return isinstance(world, Simulator) and not world.settings.differentiable
 
 
 def _member(batch: Outcome, k: int) -> Outcome:

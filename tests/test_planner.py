@@ -1,0 +1,207 @@
+"""Planners: toe following, squashing, and what each planner promises."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from laws import assert_gradient
+
+import wlplan
+from wlplan.errors import InputError
+from wlplan.excavation import excavate
+from wlplan.pile import ToeContour
+from wlplan.planner import GradientSettings, SearchSettings, plan_loads, play
+from wlplan.planner.job import squash, unsquash
+from wlplan.planner.toe import TOE_RISE, Toe, distance_to_toe, pose_at, toe_of
+from wlplan.types import Action, Performance, Pile, Pose, action_vector
+
+BEST_ACTION = np.array([0.3, 2.0, 0.5, 3.5])
+SEARCH = SearchSettings(actions=12, refine_steps=15, refined=4, poses_per_metre=0.5, rows=2)
+GRADIENT = GradientSettings(starts=2, iterations=6, candidates=4, snapshot_every=3, search=SEARCH)
+
+
+def cone(dtype=jnp.float32, radius=5.0, cells=161):
+    x = 0.1 * np.arange(cells) - 8.0
+    height = np.maximum(0.5 * (radius - np.hypot(x[:, None], x[None, :])), 0.0)
+    return Pile(jnp.asarray(height, dtype), 0.1, (-8.0, -8.0))
+
+
+def bowl_world(pile, pose, action):
+    """The load falls with the distance of the action from the best one; digging is real."""
+    part = (action_vector(action) - BEST_ACTION) / np.array([0.7, 5.0, 0.7, 5.0])
+    mass = 3.0 / (1.0 + 4.0 * (part**2).sum())
+    after, volume = excavate(pile, pose, mass / 1.7, width=2.7)
+    mass = 1.7 * volume
+    return after, Performance(mass=mass, time=9.0 + mass, work=300.0 + 20.0 * mass)
+
+
+def circle(radius=4.7, n=290):
+    """The toe of the cone where it rises by TOE_RISE."""
+    angle = 2 * np.pi * np.arange(n) / n
+    return ToeContour(
+        points=radius * np.stack([np.cos(angle), np.sin(angle)], axis=1),
+        heading=angle - np.pi,
+        length=2 * np.pi * radius,
+        closed=True,
+        accessible=np.ones(n, bool),
+    )
+
+
+def test_squashing_stays_in_the_box_and_is_inverted():
+    raw = jnp.asarray([-40.0, 40.0, 0.0, 1.0])
+    action = action_vector(squash(raw))
+    np.testing.assert_allclose(action[:3], [0.0, 5.0, 0.35], atol=1e-6)
+    part = np.array([0.2, 0.5, 0.7, 0.9])
+    back = action_vector(squash(jnp.asarray(unsquash(part), jnp.float32)))
+    np.testing.assert_allclose(back / np.array([0.7, 5.0, 0.7, 5.0]), part, rtol=1e-5)
+
+
+@pytest.mark.parametrize("position", [0.0, 0.3, 0.999, 1.25, -0.4])
+def test_a_pose_is_on_the_toe_and_points_into_the_pile(position):
+    toe, pile = toe_of(circle()), cone()
+    pose = pose_at(toe, pile, jnp.asarray(position), jnp.asarray(0.0))
+    assert math.hypot(pose.x, pose.y) == pytest.approx(5.0 - TOE_RISE / 0.5, abs=0.15)
+    angle = 2 * np.pi * position
+    assert math.cos(float(pose.heading) - angle - np.pi) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_pose_follows_the_toe_of_a_dug_pile():
+    toe, pile = toe_of(circle()), cone()
+    first = pose_at(toe, pile, jnp.asarray(0.1), jnp.asarray(0.2))
+    dug, _ = excavate(pile, first, jnp.asarray(2.0), width=2.7)
+    second = pose_at(toe, dug, jnp.asarray(0.1), jnp.asarray(0.2))
+    assert float(first.heading) == float(second.heading)
+    moved = math.hypot(float(second.x - first.x), float(second.y - first.y))
+    assert 0.5 < moved < 3.0
+    assert float(distance_to_toe(dug, second)) == pytest.approx(0.0, abs=0.02)
+
+
+def test_without_a_pile_on_the_way_the_pose_stays_on_the_contour():
+    flat = Pile(jnp.zeros((161, 161)), 0.1, (-8.0, -8.0))
+    pose = pose_at(toe_of(circle()), flat, jnp.asarray(0.0), jnp.asarray(0.0))
+    assert float(pose.x) == pytest.approx(4.7, abs=1e-5)
+
+
+def test_the_pose_is_differentiable_along_the_toe():
+    with jax.enable_x64(True):
+        pile = cone(jnp.float64)
+        toe = toe_of(circle(), np.float64)
+
+        def cost(inputs):
+            pose = pose_at(toe, pile, *inputs)
+            return pose.x + 0.3 * pose.y - 0.7 * pose.heading
+
+        assert_gradient(cost, (jnp.asarray(0.1237), jnp.asarray(0.21)), relative=1e-5)
+
+
+def test_only_accessible_points_are_dug():
+    contour = circle()
+    accessible = contour.accessible.copy()
+    accessible[50:120] = accessible[200:220] = False
+    toe = toe_of(dataclasses.replace(contour, accessible=accessible))
+    assert not toe.closed
+    assert toe.points.shape[0] == accessible.sum()
+    # Beyond the longest gap is where the path begins.
+    np.testing.assert_allclose(toe.points[0], contour.points[120], atol=1e-6)
+    reach = Toe(points=toe.points, direction=toe.direction, closed=False)
+    for position in np.linspace(-0.2, 1.2, 60):
+        pose = pose_at(reach, cone(), jnp.asarray(position), jnp.asarray(0.0))
+        turn = (math.atan2(pose.y, pose.x) / (2 * np.pi) % 1.0) * 290
+        assert accessible[round(turn) % 290] or accessible[round(turn - 0.6) % 290]
+
+
+@pytest.mark.parametrize("planner", ["greedy", "nominal"])
+def test_the_best_action_is_found(planner):
+    settings = dataclasses.replace(SEARCH, refine_steps=40)
+    plan = plan_loads(
+        bowl_world, cone(), loads=2, planner=planner, settings=settings, contour=circle()
+    ).plan
+    found = np.asarray(action_vector(plan.action)) / np.array([0.7, 5.0, 0.7, 5.0])
+    assert np.abs(found - BEST_ACTION / np.array([0.7, 5.0, 0.7, 5.0])).max() < 0.15
+
+
+@pytest.fixture(scope="module")
+def plans():
+    results = {}
+    for planner, settings in (("nominal", SEARCH), ("greedy", SEARCH), ("gradient", GRADIENT)):
+        results[planner] = plan_loads(
+            bowl_world, cone(), loads=3, planner=planner, settings=settings, contour=circle()
+        )
+    return results
+
+
+def test_a_gradient_plan_costs_at_most_what_greedy_and_nominal_cost(plans):
+    assert plans["gradient"].cost <= plans["greedy"].cost
+    assert plans["gradient"].cost <= plans["nominal"].cost
+
+
+def test_the_same_seed_gives_the_same_plan(plans):
+    again = plan_loads(
+        bowl_world, cone(), loads=3, planner="greedy", settings=SEARCH, contour=circle()
+    )
+    for a, b in zip(
+        jax.tree.leaves(again.plan), jax.tree.leaves(plans["greedy"].plan), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_result_is_what_its_plan_yields(plans):
+    """The plan in a result, played again with its poses as they are, gives the result."""
+    result = plans["gradient"]
+    assert result.plan.pose.x.shape == (3,)
+    assert result.costs.shape == (3,)
+    assert float(result.costs.sum()) == pytest.approx(float(result.cost), rel=1e-6)
+    again = play(bowl_world, cone(), result.plan)
+    np.testing.assert_allclose(
+        again.rollout.performance.mass, result.rollout.performance.mass, rtol=1e-5
+    )
+    assert float(again.cost) == pytest.approx(float(result.cost), rel=1e-5)
+
+
+def test_a_referee_has_the_last_word_among_the_candidates():
+    def contrary(pile, pose, action):
+        """Likes what the planner's world does not: another best action."""
+        after, performance = bowl_world(pile, pose, action)
+        gain = action_vector(action) @ np.array([0.0, 1.0, 0.0, 0.0])
+        return after, performance.replace(mass=performance.mass * (0.5 + 0.2 * gain))
+
+    options = {
+        "loads": 2,
+        "planner": "gradient",
+        "settings": GRADIENT,
+        "contour": circle(),
+    }
+    alone = plan_loads(bowl_world, cone(), **options)
+    judged = plan_loads(bowl_world, cone(), referee=contrary, **options)
+    greedy = plan_loads(
+        bowl_world, cone(), loads=2, planner="greedy", settings=SEARCH, contour=circle()
+    )
+    assert alone.refereed is None
+    assert judged.refereed.cost <= play(contrary, cone(), alone.plan).cost * (1 + 1e-6)
+    assert judged.refereed.cost <= play(contrary, cone(), greedy.plan).cost * (1 + 1e-6)
+    assert judged.cost <= greedy.cost * (1 + 1e-5)
+
+
+def test_bad_requests_are_refused():
+    with pytest.raises(InputError, match="unknown planner"):
+        plan_loads(bowl_world, cone(), planner="best")
+    with pytest.raises(InputError, match="at least 1"):
+        plan_loads(bowl_world, cone(), loads=0)
+    with pytest.raises(InputError, match="unknown objective"):
+        plan_loads(bowl_world, cone(), objective="speed")
+    with pytest.raises(InputError, match="derivatives"):
+        plan_loads(wlplan.Simulator(), cone(), planner="gradient")
+    with pytest.raises(InputError):
+        plan_loads(bowl_world, Pile(jnp.zeros((100, 100)), 0.1))
+
+
+def test_a_plan_can_be_made_of_loading_plan_leaves():
+    plan = wlplan.LoadingPlan(
+        pose=Pose(jnp.asarray([-5.0]), jnp.asarray([0.0]), jnp.asarray([0.0])),
+        action=Action(*(jnp.asarray([v], jnp.float32) for v in BEST_ACTION)),
+    )
+    outcome = play(bowl_world, cone(), plan)
+    assert float(outcome.rollout.performance.mass[0]) == pytest.approx(3.0, rel=1e-4)

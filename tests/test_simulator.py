@@ -1,0 +1,513 @@
+"""The simulator: ledgers, symmetries and trends of a loading; then values; then gradients."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import ndimage, stats
+
+from wlplan.automaton import relax, steepest_slope
+from wlplan.heightmap import local_axes
+from wlplan.machine import GRAVEL, WA320
+from wlplan.pile import SEED_PILES, seed_pile, toe_contour
+from wlplan.simulator import STOP_REASONS, Settings, Simulator, dig
+from wlplan.types import Action, Pile, Pose, action_from
+from wlplan.units import ACTION_HIGH, GRAVITY
+
+ALONG, LEFT = local_axes(52, 1.0)
+GRID = 224  # cells a side that hold any seed pile
+POSES = 10  # random poses and actions a seed pile
+BATCH = 64  # one compiled batch of `dig` serves most tests
+DENSITY = GRAVEL.density / 1000.0  # [tonne/m^3]
+MODERATE = np.array([0.35, 2.5, 0.35, 2.5])
+
+
+def random_actions(rng, n):
+    return (rng.uniform(size=(n, 4)) * ACTION_HIGH).astype(np.float32)
+
+
+# --- Whole loadings on the seed piles: one batch, played once. ---------------------------------
+
+
+@pytest.fixture(scope="module")
+def seed_piles():
+    """Every seed pile relaxed, on a grid of one size, and its toe."""
+    relaxed = jax.jit(relax)
+    piles = []
+    for number, (kind, slope) in enumerate(SEED_PILES):
+        pile = seed_pile(kind, slope=slope, seed=number)
+        before = [(GRID - n) // 2 for n in pile.height.shape]
+        widths = [(b, GRID - n - b) for b, n in zip(before, pile.height.shape, strict=True)]
+        pile = Pile(
+            jnp.pad(pile.height, widths),
+            pile.cell_size,
+            pile.origin - pile.cell_size * jnp.asarray(before, jnp.float32),
+        )
+        pile = relaxed(pile)
+        piles.append((pile, toe_contour(pile)))
+    return piles
+
+
+@pytest.fixture(scope="module")
+def loadings(seed_piles):
+    """Random loadings on every seed pile, on uneven ground, and where there is nothing to dig.
+
+    Returns the piles, poses and actions, what `Simulator.play` makes of them, and the slices of
+    the three groups.
+    """
+    rng = np.random.default_rng(0)
+    floors, heights, origins, poses = [], [], [], []
+    x, y = np.meshgrid(0.1 * np.arange(GRID), 0.1 * np.arange(GRID), indexing="ij")
+    rough = 0.1 * np.sin(1.3 * x + 0.4) * np.cos(0.9 * y) + 0.03 * x
+
+    def add(pile, contour, count, floor, turn):
+        for k in rng.choice(np.flatnonzero(contour.accessible), count, replace=False):
+            floors.append(floor)
+            heights.append(np.asarray(pile.height) + floor)
+            origins.append(np.asarray(pile.origin))
+            poses.append([*contour.points[k], contour.heading[k] + turn(rng)])
+
+    for pile, contour in seed_piles:
+        add(pile, contour, POSES, np.zeros((GRID, GRID)), lambda r: r.normal(0.0, 0.2))
+    for pile, contour in seed_piles:
+        add(pile, contour, 2, rough, lambda r: r.normal(0.0, 0.2))
+    # Away from the pile, over the edge of the grid, and flat ground.
+    pile, contour = seed_piles[0]
+    for x, y, heading in ((-8.0, 0.0, math.pi), (-11.0, -11.0, -2.4), (40.0, 3.0, 0.0)):
+        floors.append(np.zeros((GRID, GRID)))
+        heights.append(np.asarray(pile.height))
+        origins.append(np.asarray(pile.origin))
+        poses.append([x, y, heading])
+    floors.append(np.zeros((GRID, GRID)))
+    heights.append(np.zeros((GRID, GRID)))
+    origins.append(np.asarray(pile.origin))
+    poses.append([0.0, 0.0, 0.5])
+
+    poses = jnp.asarray(np.array(poses), jnp.float32)
+    piles = Pile(
+        jnp.asarray(np.array(heights), jnp.float32),
+        0.1,
+        jnp.asarray(np.array(origins), jnp.float32),
+        ground=jnp.asarray(np.array(floors), jnp.float32),
+    )
+    actions = action_from(jnp.asarray(random_actions(rng, len(poses))))
+    inputs = piles, Pose(poses[:, 0], poses[:, 1], poses[:, 2]), actions
+    play = jax.jit(jax.vmap(Simulator().play))
+    seeds = POSES * len(seed_piles)
+    uneven = seeds + 2 * len(seed_piles)
+    groups = slice(0, seeds), slice(seeds, uneven), slice(uneven, None)
+    return play, inputs, play(*inputs), groups
+
+
+def test_what_leaves_the_grid_is_the_load(loadings):
+    _, (piles, _, _), (after, performance, cycle), (seeds, uneven, nothing) = loadings
+    before, left = (np.asarray(p.height, np.float64).sum((1, 2)) for p in (piles, after))
+    lost = (before - left) * piles.cell_size**2 * DENSITY
+    mass = np.asarray(performance.mass, np.float64)
+    for group in (seeds, uneven):
+        np.testing.assert_allclose(lost[group], mass[group], rtol=1e-5)
+    np.testing.assert_allclose(lost[nothing], 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(cycle.mass), 1000.0 * mass, rtol=1e-6)
+
+
+def test_the_ledger_can_fail(loadings):
+    _, (piles, _, _), (after, performance, _), _ = loadings
+    before, left = (np.asarray(p.height, np.float64).sum((1, 2)) for p in (piles, after))
+    lost = (before - left) * piles.cell_size**2 * DENSITY
+    wrong = np.asarray(performance.mass, np.float64) * (1 + 3e-5)
+    with pytest.raises(AssertionError):
+        np.testing.assert_allclose(lost[:60], wrong[:60], rtol=1e-5)
+
+
+def test_nothing_is_dug_below_the_ground(loadings):
+    _, (piles, _, _), (after, _, _), _ = loadings
+    assert (np.asarray(after.height) - np.asarray(piles.ground)).min() >= -1e-5
+
+
+def test_the_pile_far_from_the_bucket_is_left_alone(loadings):
+    _, (piles, pose, _), (after, _, _), (seeds, _, _) = loadings
+    axis = 0.1 * np.arange(GRID)
+    x, y = (np.asarray(piles.origin)[seeds, k, None] + axis for k in (0, 1))
+    far = (
+        np.hypot(
+            (x - np.asarray(pose.x)[seeds, None])[:, :, None],
+            (y - np.asarray(pose.y)[seeds, None])[:, None, :],
+        )
+        > 9.0
+    )
+    moved = np.abs(np.asarray(after.height) - np.asarray(piles.height))[seeds]
+    assert (moved * far).max() == 0.0
+
+
+def test_the_pile_after_is_close_to_the_angle_of_repose(loadings):
+    """Within what the default schedule of the automaton promises, and a little."""
+    _, _, (after, _, _), (seeds, _, _) = loadings
+    steepest = jax.vmap(steepest_slope)(Pile(after.height[seeds], 0.1))
+    assert np.degrees(np.median(steepest)) < 34.0
+    assert np.degrees(np.max(steepest)) < 40.0
+
+
+def test_where_there_is_nothing_the_bucket_stays_empty(loadings):
+    _, (piles, _, _), (after, performance, cycle), (_, _, nothing) = loadings
+    np.testing.assert_allclose(np.asarray(performance.mass)[nothing], 0.0, atol=1e-6)
+    np.testing.assert_array_equal(after.height[nothing], piles.height[nothing])
+    reasons = np.asarray(cycle.stop_reason)[nothing]
+    assert set(reasons) <= {STOP_REASONS.index(r) for r in ("tilt_end", "penetration", "breakout")}
+
+
+def test_everything_is_finite(loadings):
+    _, _, outcome, _ = loadings
+    for leaf in jax.tree.leaves(outcome):
+        assert np.isfinite(leaf).all()
+
+
+def test_outcomes_lie_in_the_expected_ranges(loadings):
+    _, _, (_, performance, cycle), (seeds, _, _) = loadings
+    mass, time, work = (
+        np.asarray(v)[seeds] for v in (performance.mass, performance.time, performance.work)
+    )
+    assert mass.min() > 0.2
+    assert mass.max() < 5.0
+    assert 2.0 < np.median(mass) < 4.0
+    assert time.min() > 6.0
+    assert time.max() < 26.0
+    assert work.min() > 100.0
+    assert work.max() < 1600.0
+    # Which event ends a cycle is up to the action.
+    assert np.bincount(np.asarray(cycle.stop_reason)[seeds], minlength=4)[:3].min() > 0
+
+
+def test_the_parts_of_the_work_are_its_sum_and_not_negative(loadings):
+    _, _, (_, performance, cycle), _ = loadings
+    parts = [cycle.work_drive, cycle.work_boom, cycle.work_bucket, cycle.work_slip]
+    for part in parts:
+        assert np.min(part) >= 0.0
+    np.testing.assert_allclose(sum(parts) / 1000.0, performance.work, rtol=1e-5)
+
+
+def test_a_batch_equals_its_members(loadings):
+    """A batch of copies ends when its one member does, whatever the others of the batch did."""
+    play, inputs, outcome, (_, uneven, _) = loadings
+    slowest = int(np.argmax(np.asarray(outcome[1].time)))
+    for k in {0, 17, uneven.start, slowest}:
+        copies = jax.tree.map(lambda v, k=k: jnp.broadcast_to(v[k], v.shape), inputs)
+        alone = play(*copies)
+        jax.tree.map(
+            lambda one, all_, k=k: np.testing.assert_allclose(one[3], all_[k], rtol=1e-5, atol=1e-5),
+            alone,
+            outcome,
+        )
+
+
+# --- Single digs on made-up surfaces. ----------------------------------------------------------
+
+
+def ramp(slope, incidence=0.0, top=4.0):
+    """A plane that rises from the dig location, cut off at a height [m]; angles in degrees."""
+    a = math.radians(incidence)
+    distance = math.cos(a) * ALONG[:, None] + math.sin(a) * LEFT[None, :]
+    return np.clip(math.tan(math.radians(slope)) * distance, 0.0, top).astype(np.float32)
+
+
+def bumpy(seed, slope=26.0):
+    """A ramp with smooth random bumps, no two sides alike."""
+    noise = np.random.default_rng(seed).normal(size=(52, 52))
+    noise = ndimage.gaussian_filter(noise, 6.0)
+    return np.maximum(ramp(slope) * (1.0 + 0.5 * noise / noise.std() * 0.3), 0.0).astype(np.float32)
+
+
+def batched(settings=Settings(), machine=WA320, batch=BATCH):
+    """`dig` over lists of surfaces and actions, compiled for batches of one size."""
+
+    @jax.jit
+    @jax.vmap
+    def run(height, action):
+        return dig(
+            height,
+            jnp.zeros_like(height),
+            action_from(action),
+            settings=settings,
+            machine=machine,
+        )
+
+    def call(heights, actions):
+        heights, actions = np.array(heights, np.float32), np.array(actions, np.float32)
+        n = len(actions)
+        assert n <= batch
+        fill = np.minimum(np.arange(batch), n - 1)
+        return jax.tree.map(
+            lambda v: np.asarray(v)[:n], run(jnp.asarray(heights[fill]), jnp.asarray(actions[fill]))
+        )
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def digs():
+    return batched()
+
+
+def total_work(cycle):
+    return cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
+
+
+# Actions, and surfaces, that end in each event.
+ENDS = {
+    "tilt_end": (ramp(30.0), [0.7, 0.0, 0.0, 5.0]),
+    "penetration": (ramp(8.0), [0.7, 0.0, 0.7, 0.0]),
+    "breakout": (ramp(25.0), [0.0, 5.0, 0.7, 0.0]),
+    "timeout": (ramp(32.0), [0.7, 0.0, 0.7, 0.0]),
+}
+
+
+@pytest.fixture(scope="module")
+def ends(digs):
+    cycles = digs([h for h, _ in ENDS.values()], [a for _, a in ENDS.values()])
+    return {r: jax.tree.map(lambda v, k=k: v[k], cycles) for k, r in enumerate(ENDS)}
+
+
+@pytest.mark.parametrize("reason", STOP_REASONS)
+def test_every_event_ends_some_dig(ends, reason):
+    assert STOP_REASONS[int(ends[reason].stop_reason)] == reason
+    assert 0.0 < ends[reason].fill_time <= 15.0 + 1e-4
+
+
+def test_events_are_located_where_they_are_defined(ends):
+    assert ends["penetration"].tip_x == pytest.approx(3.2, abs=1e-3)
+    assert ends["penetration"].tip_z == pytest.approx(0.0, abs=1e-3)
+    assert ends["timeout"].fill_time == pytest.approx(15.0, abs=1e-3)
+    # At the tilt end, with the boom down, the edge has swung up about the pin.
+    forward = math.sqrt(WA320.tip_radius**2 - pin_height() ** 2)
+    swung = forward * math.sin(WA320.tilt_end) + pin_height() * (1 - math.cos(WA320.tilt_end))
+    assert ends["tilt_end"].tip_z == pytest.approx(swung, abs=2e-3)
+    # At the breakout, the edge clears the surface that was there by 5 cm.
+    breakout, surface = ends["breakout"], ENDS["breakout"][0]
+    assert breakout.tip_x > 0.3
+    there = np.interp(breakout.tip_x, ALONG, surface.mean(axis=1))
+    assert breakout.tip_z - there == pytest.approx(0.05, abs=2e-3)
+
+
+def pin_height():
+    return WA320.pivot_height + WA320.boom_length * math.sin(WA320.boom_low)
+
+
+def test_no_dig_goes_past_an_event(digs):
+    rng = np.random.default_rng(1)
+    cycle = digs([bumpy(k) for k in range(BATCH)], random_actions(rng, BATCH))
+    assert (cycle.tip_x <= 3.2 + 1e-3).all()
+    assert (cycle.fill_time <= 15.0 + 1e-3).all()
+    assert (cycle.fill_time > 0.0).all()
+    reached = cycle.stop_reason == STOP_REASONS.index("penetration")
+    np.testing.assert_allclose(cycle.tip_x[reached], 3.2, atol=1e-3)
+
+
+def test_left_and_right_are_alike(digs):
+    rng = np.random.default_rng(2)
+    surfaces, actions = [bumpy(k) for k in range(20)], random_actions(rng, 20)
+    assert max(np.abs(h - h[:, ::-1]).max() for h in surfaces) > 0.1
+    straight, mirrored = digs(surfaces, actions), digs([h[:, ::-1] for h in surfaces], actions)
+    for name in ("mass", "time", "fill_time"):
+        np.testing.assert_allclose(getattr(mirrored, name), getattr(straight, name), rtol=1e-3)
+    np.testing.assert_allclose(total_work(mirrored), total_work(straight), rtol=1e-3)
+    # A cycle may hang on rounding where two events coincide: nearly all, and the mean.
+    difference = np.abs(mirrored.height[:, :, ::-1] - straight.height).max(axis=(1, 2))
+    assert np.median(difference) < 1e-4
+    assert difference.max() < 2e-2
+
+
+def test_the_local_ledger_closes(digs):
+    rng = np.random.default_rng(3)
+    surfaces = np.array([bumpy(k) for k in range(20)])
+    cycle = digs(surfaces, random_actions(rng, 20))
+    lost = surfaces.sum((1, 2), dtype=np.float64) - cycle.height.sum((1, 2), dtype=np.float64)
+    np.testing.assert_allclose(lost * 0.01 * GRAVEL.density, cycle.mass, rtol=2e-5)
+    assert cycle.height.min() >= -1e-6
+
+
+def test_a_smaller_time_step_changes_little(digs):
+    rng = np.random.default_rng(4)
+    surfaces, actions = [bumpy(k) for k in range(24)], random_actions(rng, 24)
+    coarse = digs(surfaces, actions)
+    fine = batched(Settings(step=0.005), batch=24)(surfaces, actions)
+    for a, b in (
+        (coarse.mass, fine.mass),
+        (coarse.time, fine.time),
+        (total_work(coarse), total_work(fine)),
+    ):
+        assert np.abs(a / b - 1).mean() < 0.015
+
+
+def test_a_steeper_slope_loads_more_a_second(digs):
+    slopes = (15.0, 20.0, 25.0, 30.0)
+    actions = [MODERATE, [0.2, 2.0, 0.3, 2.0], [0.5, 3.0, 0.4, 3.0], [0.3, 1.5, 0.2, 1.0]]
+    cycle = digs([ramp(s) for s in slopes for _ in actions], actions * len(slopes))
+    productivity = (cycle.mass / cycle.time).reshape(len(slopes), -1).mean(axis=1)
+    assert np.all(np.diff(productivity) > 0.0), productivity
+
+
+def test_head_on_loads_more_a_second_than_aslant(digs):
+    angles = (0.0, 20.0, 40.0)
+    actions = [MODERATE, [0.2, 2.0, 0.3, 2.0], [0.5, 3.0, 0.4, 3.0], [0.3, 1.5, 0.2, 1.0]]
+    cycle = digs([ramp(28.0, a) for a in angles for _ in actions], actions * len(angles))
+    productivity = (cycle.mass / cycle.time).reshape(len(angles), -1).mean(axis=1)
+    assert productivity[0] > productivity[2], productivity
+
+
+def test_tilting_later_digs_deeper_and_fills_more(digs):
+    thresholds = np.linspace(0.15, 0.5, 8)
+    cycle = digs([ramp(28.0)] * 8, [[0.7, 0.0, t, 3.0] for t in thresholds])
+    assert np.all(np.diff(cycle.tip_x) > -1e-3), cycle.tip_x
+    assert cycle.mass[-1] > 1.2 * cycle.mass[0], cycle.mass
+    assert stats.spearmanr(thresholds, cycle.mass).statistic > 0.9
+
+
+def test_a_drive_into_nothing_has_a_closed_form(digs):
+    """Approach and penetration at a steady speed, tilt, brake, and the way back."""
+    cycle = digs([np.zeros((52, 52))], [[0.7, 0.0, 0.7, 0.0]])
+    speed, weight = WA320.travel_speed, WA320.mass * GRAVITY
+    # The speed controller gives way to rolling resistance.
+    steady = speed - WA320.rolling_resistance * weight / WA320.speed_gain
+    fill = 3.2 / steady
+    tilting = WA320.tilt_end / WA320.tilt_speed + 0.05 + 0.02
+    braking = steady**2 / (2 * GRAVITY * (WA320.traction + WA320.rolling_resistance))
+    accelerating = WA320.mass * speed**2 / 2 / WA320.wheel_power / 3
+    back = max(
+        (5.0 + 3.2 + braking) / speed + accelerating,
+        (WA320.boom_carry - WA320.boom_low) / (0.6 * WA320.boom_speed),
+    )
+    assert cycle.mass == 0.0
+    assert cycle.fill_time == pytest.approx(fill, rel=1e-2)
+    assert cycle.time == pytest.approx(5.0 / speed + fill + max(tilting, 0.5) + back, rel=1e-2)
+    assert cycle.work_slip == 0.0
+
+
+# --- Against the discrete elements: a guard against regressions, not a validation. --------------
+
+# The machine of the discrete-element cycles; see the provenance in the file.
+DEM_MACHINE = dataclasses.replace(
+    WA320,
+    mass=15_500.0,
+    boom_length=2.6,
+    pivot_height=1.9,
+    boom_low=math.asin((0.35 - 1.9) / 2.6),
+    tip_radius=math.hypot(1.32, 0.35),
+    tilt_end=math.radians(50.0),
+    boom_speed=0.23,
+    tilt_speed=0.55,
+    tilt_moment=220e3,
+    traction=0.75,
+    wheel_power=110e3,
+    speed_gain=2e5,
+    bucket_heaped=3.05,
+)
+
+
+@pytest.fixture(scope="module")
+def against_dem():
+    with np.load(Path(__file__).parent / "references" / "dem_cycles.npz") as file:
+        reference = dict(file)
+    # Their cells lie half a cell off ours.
+    height = reference["h0_cg"].astype(np.float32)
+    height = ndimage.shift(height, (0, 0.5, 0), order=1, mode="nearest")
+    count = len(height)
+    cycle = batched(machine=DEM_MACHINE, batch=count)(height, reference["action"])
+    return reference, cycle
+
+
+def test_the_stored_reference_says_where_it_comes_from(against_dem):
+    reference, _ = against_dem
+    assert "LAMMPS" in str(reference["provenance"])
+    assert reference["h0_cg"].shape == (len(reference["mass_t"]), 52, 52)
+
+
+def test_masses_rank_like_the_discrete_elements(against_dem):
+    reference, cycle = against_dem
+    simulated = cycle.mass / 1000.0
+    assert stats.spearmanr(simulated, reference["mass_t"]).statistic >= 0.75
+    assert abs(np.mean(simulated / reference["mass_t"]) - 1.0) < 0.15
+
+
+def test_times_and_works_are_not_far_from_the_discrete_elements(against_dem):
+    reference, cycle = against_dem
+    work = (cycle.work_drive + cycle.work_boom + cycle.work_bucket) / 1000.0
+    assert abs(np.mean(cycle.time / reference["time_s"]) - 1.0) < 0.15
+    assert abs(np.mean(work / reference["work_kJ"]) - 1.0) < 0.25
+
+
+# --- Derivatives. -------------------------------------------------------------------------------
+
+# Poses on a noise-free cone and actions, with no event or clip close by.
+SMOOTH = np.array(
+    [
+        [-6.9, 0.6, -0.1, 0.35, 2.2, 0.3, 2.0],
+        [-6.8, -0.7, 0.15, 0.25, 1.5, 0.4, 2.8],
+    ]
+)
+
+
+@pytest.fixture(scope="module")
+def derivatives():
+    """Outcome [case, 3] of both settings, gradients and central differences [case, 3, 7]."""
+    with jax.enable_x64(True):
+        cone = seed_pile("conical", slope=math.radians(30.0), seed=3)
+        # A dig reaches no further than this corner of the grid.
+        cone = Pile(cone.height[:112, 56:168], 0.1, cone.origin + jnp.asarray([0.0, 5.6]))
+
+        def outcome(world, vector):
+            _, performance = world(cone, Pose(*vector[:3]), action_from(vector[3:]))
+            return jnp.stack([performance.mass, performance.time, performance.work])
+
+        fixed = Simulator(settings=Settings(differentiable=True))
+
+        @jax.jit
+        @jax.vmap
+        def gradient(vector, weight):
+            return jax.value_and_grad(lambda v: outcome(fixed, v) @ weight)(vector)
+
+        points = jnp.asarray(np.repeat(SMOOTH, 3, axis=0))
+        values, gradients = gradient(points, jnp.tile(jnp.eye(3), (len(SMOOTH), 1)))
+
+        forward = jax.jit(jax.vmap(lambda v: outcome(Simulator(), v)))
+        step = 1e-6
+        shifts = step * np.eye(7)
+        shifted = SMOOTH[:, None] + np.concatenate([0 * shifts[:1], shifts, -shifts])
+        out = np.asarray(forward(jnp.asarray(shifted.reshape(-1, 7)))).reshape(len(SMOOTH), 15, 3)
+        central = (out[:, 1:8] - out[:, 8:]) / (2 * step)
+        return (
+            np.asarray(values).reshape(-1, 3),
+            out[:, 0],
+            np.asarray(gradients).reshape(-1, 3, 7),
+            central.transpose(0, 2, 1),
+        )
+
+
+def test_the_differentiable_setting_gives_the_same_outcome(derivatives):
+    fixed, default, _, _ = derivatives
+    np.testing.assert_allclose(fixed, default, rtol=1e-6)
+
+
+def test_gradients_against_finite_differences(derivatives):
+    _, _, gradient, central = derivatives
+    assert np.isfinite(gradient).all()
+    size = np.linalg.norm(central, axis=-1)
+    error = np.linalg.norm(gradient - central, axis=-1)
+    assert (size > 0.0).all()
+    np.testing.assert_array_less(error, 2e-3 * size)
+
+
+def test_gradients_are_finite_where_there_is_nothing_to_dig():
+    def mass_and_more(vector):
+        cycle = dig(
+            jnp.zeros((52, 52)),
+            jnp.zeros((52, 52)),
+            Action(*vector),
+            settings=Settings(differentiable=True),
+        )
+        return cycle.mass + cycle.time + cycle.work_drive
+
+    gradient = jax.jit(jax.grad(mass_and_more))(jnp.asarray(MODERATE, jnp.float32))
+    assert np.isfinite(gradient).all()
