@@ -71,9 +71,7 @@ def test_boom_force_is_the_virtual_work_of_a_small_lift(vertical, horizontal):
 
 def test_a_lowered_boom_feels_the_horizontal_force():
     """This is what triggers the controller; a boom above the horizontal is relieved by it."""
-    rest, pushed = (
-        loader.boom_force(WA320, *scalars(WA320.boom_low, 0.0, h)) for h in (0.0, 50e3)
-    )
+    rest, pushed = (loader.boom_force(WA320, *scalars(WA320.boom_low, 0.0, h)) for h in (0.0, 50e3))
     assert pushed > rest > 0.0
     rest, pushed = (loader.boom_force(WA320, *scalars(0.3, 0.0, h)) for h in (0.0, 50e3))
     assert pushed < rest

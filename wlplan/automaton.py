@@ -5,7 +5,7 @@ f * max(h_i - h_k - d tan(repose), 0) from the higher to the lower cell (eight n
 flow is antisymmetric, so volume is kept by construction; with f = 1/8 the Jacobian of a sweep is
 symmetric, has unit row sums and is non-expansive, so its gradient cannot explode. This is our
 reading of the mass-preserving automaton of Pla-Castells et al. (2004), which the paper employs
-(section 3.6), with eight neighbours in place of four.
+(section 4.6), with eight neighbours in place of four.
 
 Sweeps alone converge slowly over long distances, so `settle` runs them coarse to fine: heights are
 averaged onto a grid of twice the spacing, relaxed there, and the change is interpolated back. A

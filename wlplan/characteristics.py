@@ -1,4 +1,4 @@
-"""The four local pile characteristics: slope, incidence and two curvatures. Paper, section 3.3."""
+"""The four local pile characteristics: slope, incidence and two curvatures. Paper, section 4.3."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Training data: loading cycles played by the simulator, stored, split and normalised.
 
-The protocol is the paper's (section 5.2). A rollout takes one of the six seed piles, with noise of
+The protocol is the paper's (section 6.2). A rollout takes one of the six seed piles, with noise of
 its own, and digs it 30 times in a row; each loading starts at a random accessible point of the toe
 of the pile as it then is, heads into it to within 10 degrees of the normal, and takes its action
 from a Latin hypercube. A set is one rollout of each seed pile; its 180 actions are one hypercube.
@@ -57,9 +57,9 @@ from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE, J_PER_KJ
 DATASET_FORMAT = "wlplan.dataset/1"
 
 LOADS = 30
-"""Consecutive loadings of a rollout. Paper, section 5.2."""
+"""Consecutive loadings of a rollout. Paper, section 6.2."""
 
-# Largest deviation of the heading from the normal of the toe [rad]. Paper, section 5.2.
+# Largest deviation of the heading from the normal of the toe [rad]. Paper, section 6.2.
 _HEADING_SPREAD = math.radians(10.0)
 # Rollouts in one call of the simulator. While one group is simulated the host looks for the dig
 # locations of the next; a cycle waits for the slowest of its group.
@@ -744,13 +744,13 @@ def split(
 
 
 def reflect(maps: Float[np.ndarray, "*n i j"]) -> Float[np.ndarray, "*n i j"]:
-    """Local heightmaps of the mirrored pile, left for right. Paper, section 5.4."""
+    """Local heightmaps of the mirrored pile, left for right. Paper, section 6.4."""
     return maps[..., ::-1]
 
 
 @no_type_check
 class Normaliser(struct.PyTreeNode):
-    """Maps the range of the training data to [0, 1], component by component. Paper, section 5.4."""
+    """Maps the range of the training data to [0, 1], component by component. Paper, section 6.4."""
 
     low: Float[Array, " k"]
     span: Float[Array, " k"]

@@ -1,4 +1,4 @@
-"""Diggability maps: what one fixed action would yield all around a pile. Paper, section 6.4."""
+"""Diggability maps: what one fixed action would yield all around a pile. Paper, section 7.4."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from wlplan.errors import InputError
 from wlplan.pile import ToeContour, toe_contour
 from wlplan.types import Action, Performance, Pile, Pose, PyTree, World
 
-# The action of the paper's diggability map. Paper, section 6.4.
+# The action of the paper's diggability map. Paper, section 7.4.
 PAPER_ACTION = Action(0.68, 4.51, 0.17, 4.46)  # type: ignore[arg-type]
 
 

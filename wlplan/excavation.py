@@ -1,7 +1,7 @@
 """Removing a load from the pile along the bucket's strip, mass exact.
 
 The paper removes the predicted volume "along a strip as wide as the bucket, starting at x and
-stretching along t" (section 3.6) and does not say how it is spread. Here the cut follows a bucket:
+stretching along t" (section 4.6) and does not say how it is spread. Here the cut follows a bucket:
 level on the floor to some penetration, then rising at a fixed angle; the penetration is solved for
 so that the volume is met. The edges of the strip are soft over one cell, so the result is
 differentiable in the pose and in the volume.
@@ -23,7 +23,7 @@ from wlplan.types import Pile, Pose
 # How steeply the cut rises behind the penetration. Fitted: bucket tips in the simulator leave the
 # floor and rise at about this angle.
 _RISE = math.tan(math.radians(45.0))
-# The strip ends here [m]: the largest penetration, 3.2 m (paper, section 4.2), and the rise of a
+# The strip ends here [m]: the largest penetration, 3.2 m (paper, section 5.2), and the rise of a
 # bucket that breaks out.
 STRIP_LENGTH = 4.5
 _BISECTIONS, _NEWTON_STEPS = 9, 3

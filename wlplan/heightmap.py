@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from wlplan.types import LocalHeightmap, Pile, Pose
 from wlplan.units import CELL_SIZE
 
-# Paper, section 5.3: 3.6 m for the performance predictor, which leaves 0.5 m on either side of the
+# Paper, section 6.3: 3.6 m for the performance predictor, which leaves 0.5 m on either side of the
 # bucket; 5.2 m displaced by 1.0 m towards the approach for the pile state predictor.
 PERFORMANCE_CELLS, PERFORMANCE_DISPLACEMENT = 36, 0.0
 STATE_CELLS, STATE_DISPLACEMENT = 52, 1.0
@@ -77,7 +77,7 @@ def sample_local(
     cells: int = PERFORMANCE_CELLS,
     displacement: float = PERFORMANCE_DISPLACEMENT,
 ) -> LocalHeightmap:
-    """The local heightmap of the paper's section 3.2 at one dig pose.
+    """The local heightmap of the paper's section 4.2 at one dig pose.
 
     Args:
         pile: The pile; its own spacing may differ from the 0.1 m of the map.

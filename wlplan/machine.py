@@ -16,9 +16,9 @@ class WheelLoader:
 
     # Operating mass [kg]. Manufacturer's brochure: 15.2 t.
     mass: float = 15_200.0
-    # Approach and reverse speed [m/s]. Paper, section 4.2: 8 km/h.
+    # Approach and reverse speed [m/s]. Paper, section 5.2: 8 km/h.
     travel_speed: float = 8.0 / 3.6
-    # Distance from the dig location at which a cycle starts and ends [m]. Paper, section 4.2.
+    # Distance from the dig location at which a cycle starts and ends [m]. Paper, section 5.2.
     approach_distance: float = 5.0
     # Tyre friction on firm gravel [1]. Estimate, 0.6 to 0.75 in the literature.
     traction: float = 0.6
@@ -41,9 +41,7 @@ class WheelLoader:
     # Length of the bucket floor from the cutting edge to the back wall [m]. Estimate from the
     # brochure's side view.
     bucket_depth: float = 1.10
-    # Struck volume with the bucket level, and heaped volume when fully tilted [m^3]. Brochure:
-    # 2.3 to 2.7 struck, about 3.0 to 3.2 heaped.
-    bucket_struck: float = 2.3
+    # Heaped volume [m^3]. Brochure: 2.7 to 3.2 over the range of buckets.
     bucket_heaped: float = 2.8
     # Height of the boom pivot above the ground [m], and boom length to the bucket pin [m].
     # Brochure drawing: 1.9 to 1.95 and 2.6 to 2.7.
@@ -76,12 +74,11 @@ class WheelLoader:
 class Soil:
     """A homogeneous soil."""
 
-    # Bulk density [kg/m^3], internal friction [rad], cohesion [Pa], dilatancy [rad]. Dry gravel:
-    # paper, section 4.1.
+    # Bulk density [kg/m^3], internal friction [rad], cohesion [Pa]. Dry gravel: paper, section 5.1.
+    # Its dilatancy of 8 degrees plays no role here: volumes are bulk volumes throughout.
     density: float = 1727.0
     friction: float = math.radians(32.0)
     cohesion: float = 0.0
-    dilatancy: float = math.radians(8.0)
     # Soil-steel friction [rad] and adhesion [Pa]. Estimate: two thirds of the internal friction.
     steel_friction: float = math.radians(20.0)
     adhesion: float = 0.0

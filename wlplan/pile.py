@@ -19,7 +19,7 @@ from wlplan.machine import GRAVEL, WA320
 from wlplan.types import Pile
 from wlplan.units import CELL_SIZE
 
-# The seed piles of the paper, as (kind, slope [rad]). Paper, section 4.1: two triangular, two
+# The seed piles of the paper, as (kind, slope [rad]). Paper, section 6.2: two triangular, two
 # conical and two wedged, at 20 and 30 degrees.
 SEED_PILES: tuple[tuple[str, float], ...] = tuple(
     (kind, math.radians(degrees))
@@ -325,7 +325,9 @@ def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
         )
     volumes = np.bincount(labels.ravel(), weights=above.ravel())[1:] * cell**2
     largest = labels == 1 + int(np.argmax(volumes))
-    extent = _largest_extent(np.argwhere(largest) * cell) + cell
+    # The cells on the rim span the same extent as all, and are far fewer.
+    rim = largest & ~ndimage.binary_erosion(largest)
+    extent = _largest_extent(np.argwhere(rim) * cell) + cell
     if volumes.max() < _SMALLEST_VOLUME or extent < WA320.bucket_width:
         raise InputError(
             f"Nothing to dig: the largest pile holds {volumes.max():.2g} m^3 and is {extent:.2g} m "

@@ -171,7 +171,7 @@ def diggability_figure(pile: Pile, diggability: DiggabilityMap) -> Figure:
     """Mass, time and work of one action at locations around the pile.
 
     The colours of the lines, which stand on the toe along the inward normals, are those of the
-    histograms below. Paper, the figure of section 6.4.
+    histograms below. Paper, the figure of section 7.4.
 
     Args:
         pile: The pile the map was made for.

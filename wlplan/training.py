@@ -1,4 +1,4 @@
-"""Training, evaluating, saving and loading the learned models. Paper, section 5.4.
+"""Training, evaluating, saving and loading the learned models. Paper, section 6.4.
 
 A saved model is a directory: an orbax checkpoint of the weights, and `model.json`, which says what
 they are, where they come from, how good they are, and which bytes belong to them.
@@ -35,7 +35,7 @@ MODEL_FORMAT = "wlplan.model/1"
 
 _DESCRIPTION, _WEIGHTS = "model.json", "weights"
 
-# Training, validation and test. Paper, section 5.4: 10,718 cycles, 1,072 of them for the test,
+# Training, validation and test. Paper, section 6.4: 10,718 cycles, 1,072 of them for the test,
 # 10 % of the rest for validation.
 _FRACTIONS = (0.8, 0.1, 0.1)
 # Load from which an error relative to it says something [tonne]: a sixth of a full bucket. Of a

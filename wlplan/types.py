@@ -55,7 +55,7 @@ class Pose(struct.PyTreeNode):
 
 @no_type_check
 class Action(struct.PyTreeNode):
-    """Parameters of the automatic bucket-filling controller. Paper, section 4.2."""
+    """Parameters of the automatic bucket-filling controller. Paper, section 5.2."""
 
     delta_bm: Float[Array, "*batch"]  # boom force threshold [1], 0..0.7
     k_bm: Float[Array, "*batch"]  # boom velocity gain [1], 0..5
@@ -75,7 +75,7 @@ def action_from(vector: Float[Array, "*batch 4"]) -> Action:
 
 @no_type_check
 class Performance(struct.PyTreeNode):
-    """What one loading yields and costs. Paper, section 5.1."""
+    """What one loading yields and costs. Paper, section 6.1."""
 
     mass: Float[Array, "*batch"]  # [tonne]
     time: Float[Array, "*batch"]  # [s]
@@ -84,7 +84,7 @@ class Performance(struct.PyTreeNode):
 
 @no_type_check
 class Characteristics(struct.PyTreeNode):
-    """The four local pile characteristics of the low-dimensional model. Paper, section 3.3."""
+    """The four local pile characteristics of the low-dimensional model. Paper, section 4.3."""
 
     slope: Float[Array, "*batch"]  # theta [rad]
     incidence: Float[Array, "*batch"]  # alpha [rad], 0 head-on

@@ -27,7 +27,7 @@ WORLDS = ("low", "high", "hybrid", "simulator")
 
 @no_type_check
 class LowWorld(struct.PyTreeNode):
-    """The low-dimensional world: ψ_low, mass removal along the strip, automaton. Paper, 3.6."""
+    """The low-dimensional world: ψ_low, mass removal along the strip, automaton. Paper, 4.6."""
 
     model: PerformanceModel
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)

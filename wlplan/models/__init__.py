@@ -1,1 +1,1 @@
-"""Learned models of loading performance and pile state. Paper, sections 3.4 and 3.5."""
+"""Learned models of loading performance and pile state. Paper, sections 4.4 and 4.5."""

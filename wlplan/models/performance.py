@@ -1,4 +1,4 @@
-"""Performance predictors: what one loading yields and costs. Paper, section 3.4.
+"""Performance predictors: what one loading yields and costs. Paper, section 4.4.
 
 `PsiLow` is the network in units of the training data's range; `PerformanceModel` is a trained one,
 ready to be called inside other functions.
@@ -38,7 +38,7 @@ _LEAST, _BEND = 0.001, 0.01
 
 
 class PsiLow(nnx.Module):
-    """ψ_low: a multilayer perceptron over characteristics and action. Paper, section 3.4.
+    """ψ_low: a multilayer perceptron over characteristics and action. Paper, section 4.4.
 
     Args:
         hidden: Units of each hidden layer.

@@ -1,4 +1,4 @@
-"""The simulator: a loading cycle of a wheel loader on a heightfield. Paper, section 4."""
+"""The simulator: a loading cycle of a wheel loader on a heightfield. Paper, section 5."""
 
 from wlplan.simulator.cycle import STOP_REASONS, Cycle, Settings, dig
 from wlplan.simulator.world import Simulator

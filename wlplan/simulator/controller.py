@@ -8,14 +8,14 @@ from jaxtyping import Array, Float
 from wlplan.types import Action
 
 # Forces and commands are smoothed by a first-order lag whose mean delay is that of the paper's
-# moving average over 0.1 s (section 4.2) [s].
+# moving average over 0.1 s (section 5.2) [s].
 SMOOTHING_TIME = 0.05
 
 
 def command(
     action: Action, boom_force: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Target speeds of boom and bucket as parts of their maxima. Paper, section 4.2.
+    """Target speeds of boom and bucket as parts of their maxima. Paper, section 5.2.
 
     Args:
         action: Thresholds and gains.

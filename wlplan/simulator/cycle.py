@@ -1,4 +1,4 @@
-"""One loading cycle on a local heightfield: approach, dig, breakout, retreat. Paper, section 4.
+"""One loading cycle on a local heightfield: approach, dig, breakout, retreat. Paper, section 5.
 
 Time marches in fixed steps while the bucket is in the soil; the approach before it and the retreat
 after it have closed forms. An event that ends a phase is located inside its step and the state
@@ -24,12 +24,12 @@ from wlplan.types import Action
 from wlplan.units import CELL_SIZE, GRAVITY
 
 STOP_REASONS = ("tilt_end", "penetration", "breakout", "timeout")
-"""Events that end bucket filling, in the order of `Cycle.stop_reason`. Paper, section 4.2."""
+"""Events that end bucket filling, in the order of `Cycle.stop_reason`. Paper, section 5.2."""
 
-# Limits of the bucket filling: penetration [m] and time [s]. Paper, section 4.2.
+# Limits of the bucket filling: penetration [m] and time [s]. Paper, section 5.2.
 MAX_PENETRATION = 3.2
 MAX_FILL_TIME = 15.0
-# The brake holds for at least this long after the stop [s]. Paper, section 4.2.
+# The brake holds for at least this long after the stop [s]. Paper, section 5.2.
 BRAKE_TIME = 0.5
 # A breakout counts from here [m]: at the toe the edge starts level with the surface.
 _BREAKOUT_FROM = 0.3

@@ -1,0 +1,274 @@
+"""Rollouts: laws with a fake world, then the shipped low world, then its gradients."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from laws import assert_gradient
+
+import wlplan
+from wlplan.automaton import relax
+from wlplan.horizon import closed_loop, rollout
+from wlplan.machine import GRAVEL
+from wlplan.objective import OBJECTIVES
+from wlplan.pile import evenly_spaced, seed_pile, toe_contour, volume
+from wlplan.planner.job import Job, play_plan
+from wlplan.simulator import Simulator
+from wlplan.transport import Receiver
+from wlplan.types import LoadingPlan, Performance, Pile, Pose, action_from
+
+DENSITY = GRAVEL.density / 1000.0  # [tonne/m^3]
+
+
+def fake_world(pile, pose, action):
+    """Takes a part of every cell near x, the more the higher the threshold."""
+    x = pile.origin[0] + pile.cell_size * jnp.arange(pile.height.shape[0])
+    part = 0.3 * action.delta_bk * jnp.exp(-((x - pose.x) ** 2))
+    after = pile.replace(height=pile.height * (1.0 - part)[:, None])
+    mass = DENSITY * (volume(pile) - volume(after))
+    return after, Performance(mass=mass, time=5.0 + action.k_bm * mass, work=100.0 * pose.y + mass)
+
+
+def heap(seed=0):
+    height = np.random.default_rng(seed).uniform(0.5, 1.5, (20, 12)).astype(np.float32)
+    return Pile(jnp.asarray(height), 0.1, jnp.asarray([-1.0, 2.0]))
+
+
+def plan_of(rows, dtype=jnp.float32):
+    """A plan from an array [N, 7]: x, y, heading, action."""
+    rows = jnp.asarray(rows, dtype)
+    return LoadingPlan(
+        pose=Pose(rows[:, 0], rows[:, 1], rows[:, 2]), action=action_from(rows[:, 3:])
+    )
+
+
+def random_rows(seed, loads):
+    return np.random.default_rng(seed).uniform(0.1, 0.7, (loads, 7))
+
+
+# --- Laws, with the fake world. -----------------------------------------------------------------
+
+
+def test_a_rollout_is_the_loop_over_its_loadings():
+    plan, pile = plan_of(random_rows(0, 6)), heap()
+    outcome = rollout(fake_world, pile, plan)
+    for n in range(6):
+        loading = jax.tree.map(lambda leaf, n=n: leaf[n], plan)
+        pile, performance = fake_world(pile, loading.pose, loading.action)
+        jax.tree.map(
+            lambda one, all_, n=n: np.testing.assert_allclose(all_[n], one, rtol=1e-5),
+            performance,
+            outcome.performance,
+        )
+    np.testing.assert_allclose(outcome.pile.height, pile.height, rtol=1e-5)
+    assert outcome.performance.mass.shape == (6,)
+
+
+def test_no_loading_leaves_the_pile():
+    outcome = rollout(fake_world, heap(), plan_of(np.zeros((0, 7))))
+    np.testing.assert_array_equal(outcome.pile.height, heap().height)
+    assert outcome.performance.mass.shape == (0,)
+
+
+def test_the_parts_of_a_rollout_follow_on():
+    rows = random_rows(1, 5)
+    whole = rollout(fake_world, heap(), plan_of(rows))
+    first = rollout(fake_world, heap(), plan_of(rows[:2]))
+    second = rollout(fake_world, first.pile, plan_of(rows[2:]))
+    np.testing.assert_allclose(whole.pile.height, second.pile.height, rtol=1e-6)
+    np.testing.assert_allclose(
+        whole.performance.work,
+        np.concatenate([first.performance.work, second.performance.work]),
+        rtol=1e-6,
+    )
+
+
+def test_it_passes_jit_and_vmap_over_plans_and_piles():
+    plans = [plan_of(random_rows(s, 4)) for s in range(3)]
+    piles = [heap(s) for s in range(3)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *plans)
+    heaps = jax.tree.map(lambda *leaves: jnp.stack(leaves), *piles)
+    run = jax.jit(lambda pile, plan: rollout(fake_world, pile, plan))
+    over_plans = jax.vmap(run, in_axes=(None, 0))(piles[0], stacked)
+    over_both = jax.vmap(run)(heaps, stacked)
+    for k in range(3):
+        alone = run(piles[0], plans[k])
+        np.testing.assert_allclose(over_plans.pile.height[k], alone.pile.height, rtol=1e-6)
+        alone = run(piles[k], plans[k])
+        np.testing.assert_allclose(over_both.performance.mass[k], alone.performance.mass, rtol=1e-5)
+
+
+def test_it_passes_float64_and_gradients_in_plan_and_pile():
+    with jax.enable_x64(True):
+        pile = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float64), heap())
+
+        def cost(point):
+            plan, height = point
+            outcome = rollout(fake_world, pile.replace(height=height), plan)
+            assert outcome.performance.mass.dtype == jnp.float64
+            total = jax.tree.map(jnp.sum, outcome.performance)
+            return total.mass + total.time + total.work / 100.0 + (outcome.pile.height**2).sum()
+
+        assert_gradient(cost, (plan_of(random_rows(2, 3), jnp.float64), pile.height[:, :]))
+
+
+def test_closed_loop_decides_on_the_pile_as_it_is():
+    """The decision reads the pile; what it then saw is what the loop gives by hand."""
+
+    def decide(pile, threshold):
+        zero = jnp.zeros(())
+        pose = Pose(x=volume(pile), y=pile.height.max(), heading=zero)
+        return pose, action_from(jnp.stack([zero, zero, threshold, zero]))
+
+    def world(pile, pose, action):
+        after = pile.replace(height=pile.height * (1.0 - action.delta_bk))
+        return after, Performance(mass=pose.x, time=pose.y, work=pose.heading)
+
+    thresholds = jnp.asarray([0.5, 0.2, 0.1])
+    outcome, plan = closed_loop(world, heap(), thresholds, decide)
+    left = np.cumprod([1.0, 0.5, 0.8])
+    np.testing.assert_allclose(plan.pose.x, float(volume(heap())) * left, rtol=1e-5)
+    np.testing.assert_allclose(plan.pose.y, float(heap().height.max()) * left, rtol=1e-5)
+    np.testing.assert_allclose(plan.action.delta_bk, thresholds)
+    np.testing.assert_allclose(outcome.performance.mass, plan.pose.x)
+    # Played again as a fixed plan, it is the same.
+    again = rollout(world, heap(), plan)
+    np.testing.assert_allclose(again.pile.height, outcome.pile.height)
+
+
+# --- The worlds that ship. ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def low():
+    return wlplan.load_world("low")
+
+
+@pytest.fixture(scope="module")
+def cone():
+    """A relaxed 30 degree cone and five loadings along its toe, the last two where the first was.
+
+    The grid is cut to what the loadings disturb, which makes the gradient checks quick.
+    """
+    pile = jax.jit(relax)(seed_pile("conical", slope=math.radians(30.0)))
+    contour = toe_contour(pile)
+    rng = np.random.default_rng(0)
+    spots = evenly_spaced(contour, 24)[[0, 1, 3, 0, 1]]
+    rows = np.concatenate(
+        [
+            contour.points[spots] + rng.normal(0.0, 0.03, (5, 2)),
+            contour.heading[spots, None] + rng.normal(0.0, 0.1, (5, 1)),
+            rng.uniform(0.25, 0.75, (5, 4)) * [0.7, 5.0, 0.7, 5.0],
+        ],
+        axis=1,
+    )
+    # The later loadings follow the toe as it retreats.
+    step = 0.5 * (np.arange(5) > 2)
+    rows[:, 0] += step * np.cos(rows[:, 2])
+    rows[:, 1] += step * np.sin(rows[:, 2])
+    return pile, rows
+
+
+@pytest.fixture(scope="module")
+def roll():
+    """One compiled rollout for any world that is a pytree."""
+    return jax.jit(lambda world, pile, plan: rollout(world, pile, plan))
+
+
+def in_float64(tree):
+    def widen(leaf):
+        is_float = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
+        return jnp.asarray(np.asarray(leaf), jnp.float64) if is_float else leaf
+
+    return jax.tree.map(widen, tree)
+
+
+def lost_mass(before, after):
+    heights = (np.asarray(p.height, np.float64).sum() for p in (before, after))
+    first, last = heights
+    return (first - last) * before.cell_size**2 * DENSITY
+
+
+def test_the_low_world_removes_what_it_loads(low, cone, roll):
+    pile, rows = cone
+    outcome = roll(low, pile, plan_of(rows))
+    mass = np.asarray(outcome.performance.mass, np.float64)
+    assert mass.min() > 0.5
+    np.testing.assert_allclose(lost_mass(pile, outcome.pile), mass.sum(), rtol=1e-5)
+    assert outcome.pile.height.min() >= -1e-6
+    assert np.min(outcome.performance.time) > 5.0
+
+
+def test_the_simulator_rolls_out_under_the_same_signature(cone, roll):
+    pile, rows = cone
+    outcome = roll(Simulator(), pile, plan_of(rows))
+    mass = np.asarray(outcome.performance.mass, np.float64)
+    assert mass.min() > 0.5
+    np.testing.assert_allclose(lost_mass(pile, outcome.pile), mass.sum(), rtol=1e-5)
+
+
+def cost_in(world, pile):
+    """The objective of a plan, transport included, over the typical 15 loadings."""
+    receiver = Receiver(*(jnp.asarray(v, pile.height.dtype) for v in (-18.0, -3.0, -0.5)))
+    job = Job(
+        world=world, pile=pile, toe=None, receiver=receiver, objective=OBJECTIVES["efficiency"]
+    )
+    return lambda plan: play_plan(job, plan).cost
+
+
+def test_gradient_of_five_loadings_against_finite_differences(low, cone):
+    with jax.enable_x64(True):
+        world, pile = in_float64((low, cone[0]))
+        cost = cost_in(world, pile)
+        assert_gradient(cost, plan_of(cone[1], jnp.float64), skip=3)
+
+
+def test_the_gradient_check_can_fail(low, cone):
+    """A gradient that is a thousandth too long does not pass."""
+    with jax.enable_x64(True):
+        world, pile = in_float64((low, cone[0]))
+        cost = cost_in(world, pile)
+
+        def corrupted(plan):
+            value = cost(plan)
+            return value + 1e-3 * (value - jax.lax.stop_gradient(value))
+
+        with pytest.raises(AssertionError, match="differ"):
+            assert_gradient(corrupted, plan_of(cone[1][:1], jnp.float64), skip=3)
+
+
+@pytest.fixture(scope="module")
+def gradient_of_one(low):
+    """Gradient of the cost of two loadings with respect to plan and heights."""
+
+    @jax.jit
+    def run(height, origin, plan):
+        def cost(plan, height):
+            return cost_in(low, Pile(height, 0.1, origin))(plan)
+
+        return jax.value_and_grad(cost, argnums=(0, 1))(plan, height)
+
+    return run
+
+
+@pytest.mark.parametrize("case", ["on the pile", "off the pile", "off the grid", "flat", "hollow"])
+def test_gradients_are_finite_everywhere(case, cone, gradient_of_one):
+    pile, rows = cone
+    height, rows = pile.height, rows[[0, 0]]
+    if case == "off the pile":
+        rows[:, :3] = [-9.3, -9.3, -2.3]
+    if case == "off the grid":
+        rows[:, :3] = [40.0, -3.0, 0.3]
+    if case == "flat":
+        height = jnp.zeros_like(height)
+    if case == "hollow":  # nothing is left where the bucket digs
+        rows[:, :3] = [-1.0, 0.0, 0.0]
+        x = np.asarray(pile.origin)[0] + 0.1 * np.arange(height.shape[0])
+        height = jnp.where((np.abs(x) < 5.0)[:, None], 0.0, height)
+    value, gradient = gradient_of_one(height, pile.origin, plan_of(rows))
+    for leaf in jax.tree.leaves((value, gradient)):
+        assert np.isfinite(leaf).all()
+    if case == "on the pile":
+        assert min(np.abs(leaf).max() for leaf in jax.tree.leaves(gradient)) > 0.0
