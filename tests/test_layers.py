@@ -10,22 +10,21 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "wlplan"
 
 # From the bottom to the top: a module imports only from what stands before it.
-LAYERS = """
-    errors types units
-    machine
-    ground pile
-    heightmap characteristics automaton excavation
-    simulator.controller simulator.soil simulator.loader
-    simulator.terrain simulator.cycle simulator.world simulator
-    dataset
-    models models.performance
-    training worlds
-    horizon transport objective
-    planner.toe planner.job planner.search planner.gradient planner
-    diggability
-    io plots report
-    cli __main__
-""".split()
+LAYERS = [
+    *("errors", "types", "units", "compilation"),
+    *("machine",),
+    *("ground", "pile"),
+    *("heightmap", "characteristics", "automaton", "excavation"),
+    *("simulator.controller", "simulator.soil", "simulator.loader", "simulator.terrain"),
+    *("simulator.cycle", "simulator.world", "simulator"),
+    *("sampling", "dataset"),
+    *("models", "models.performance", "training"),
+    *("worlds", "horizon"),
+    *("transport", "objective"),
+    *("planner.toe", "planner.job", "planner.search", "planner.gradient", "planner"),
+    *("diggability", "io", "plots", "report"),
+    *("cli", "__main__"),
+]
 
 
 def modules(package):
@@ -185,9 +184,7 @@ def test_the_check_of_imports_can_fail(source, complaint):
 
 
 def test_the_check_of_imports_lets_pass_what_it_should():
-    source = (
-        "import jax\nfrom wlplan.types import Pile\nfrom . import machine\nimport wlplan.errors"
-    )
+    source = "import jax\nfrom wlplan.types import Pile\nfrom . import machine"
     assert not violations("pile", source, LAYERS, FILES)
     inside = "from .soil import x\nfrom wlplan.simulator import loader\nfrom ..units import GRAVITY"
     assert not violations("simulator.terrain", inside, LAYERS, FILES)

@@ -41,7 +41,8 @@ class WheelLoader:
     # Length of the bucket floor from the cutting edge to the back wall [m]. Estimate from the
     # brochure's side view.
     bucket_depth: float = 1.10
-    # Heaped volume [m^3]. Brochure: 2.7 to 3.2 over the range of buckets.
+    # Heaped volume [m^3]. Estimate: about 3 by the brochure, less here so that the fullest load,
+    # 4.8 t of gravel, comes near the largest of the paper's data set, 4.5 t (its appendix A).
     bucket_heaped: float = 2.8
     # Height of the boom pivot above the ground [m], and boom length to the bucket pin [m].
     # Brochure drawing: 1.9 to 1.95 and 2.6 to 2.7.

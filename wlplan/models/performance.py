@@ -115,12 +115,16 @@ class PerformanceModel(struct.PyTreeNode):
         Inputs are held near the range of the training data, see `soft_clamp`. The outputs are
         positive: within the range they are the network's, towards zero they bend, over a
         hundredth of the range, to a thousandth of it. So ratios such as work a tonne stay finite,
-        and so do their gradients.
+        and so do their gradients. The mass bends likewise below the largest load of the data.
         """
         raw = jnp.concatenate([jnp.asarray(characteristics), jnp.asarray(action)])
         inputs = soft_clamp(self.inputs.normalise(raw))
         network = nnx.merge(self.graph, self.params)
         predicted = self.outputs.denormalise(network(inputs))
         least, bend = _LEAST * self.outputs.span, _BEND * self.outputs.span
-        positive = least + bend * jax.nn.softplus((predicted - least) / bend)
+        # A bucket has a capacity: no load is promised above the largest that was ever seen.
+        most = self.outputs.low + self.outputs.span
+        capped = most - bend * jax.nn.softplus((most - predicted) / bend)
+        bounded = jnp.stack([capped[0], predicted[1], predicted[2]])
+        positive = least + bend * jax.nn.softplus((bounded - least) / bend)
         return Performance(mass=positive[0], time=positive[1], work=positive[2])

@@ -24,8 +24,9 @@ from jaxtyping import Array, Float
 from wlplan.machine import Soil
 from wlplan.units import GRAVITY
 
-# Failure angles tried [rad]; a parabola through the best and its neighbours refines it.
+# Failure angles tried [rad], and the steps of the parabolas that refine the best of them.
 _ANGLE_STEP = math.radians(7.0)
+_CLOSER_STEPS = (math.radians(1.5), math.radians(0.5))
 _FAILURE_ANGLES = tuple(math.radians(4.0) + k * _ANGLE_STEP for k in range(10))
 # The wedge locks where sin(eta) goes to zero; the least value it is given, which bounds the force.
 _LOCKED = 0.05
@@ -85,8 +86,19 @@ def _failure_angle(resistance: Callable[[float, float], Array]) -> Array:
         after = jnp.where(better, values[k + 1], after)
         angle = jnp.where(better, _FAILURE_ANGLES[k], angle)
         here = jnp.where(better, values[k], here)
-    # A parabola through the best trial and its neighbours.
+    angle = angle + _ANGLE_STEP * _vertex(before, here, after)
+    # Once more, closer up: the envelope theorem holds at the minimum and only there.
+    for step in _CLOSER_STEPS:
+        sine, cosine, s, c = jnp.sin(angle), jnp.cos(angle), math.sin(step), math.cos(step)
+        before = resistance(sine * c - cosine * s, cosine * c + sine * s)
+        after = resistance(sine * c + cosine * s, cosine * c - sine * s)
+        angle = angle + step * _vertex(before, resistance(sine, cosine), after)
+    return angle
+
+
+def _vertex(before: Array, here: Array, after: Array) -> Array:
+    """Where a parabola through three values is least, in steps from the middle; at most one."""
     curvature = before - 2.0 * here + after
     curved = curvature > 0.0
     offset = jnp.where(curved, 0.5 * (before - after) / jnp.where(curved, curvature, 1.0), 0.0)
-    return angle + jnp.clip(offset, -1.0, 1.0) * _ANGLE_STEP
+    return jnp.clip(offset, -1.0, 1.0)
