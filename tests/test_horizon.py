@@ -230,8 +230,10 @@ def test_the_gradient_check_can_fail():
     """A gradient that is a thousandth too long does not pass."""
     with jax.enable_x64(True):
 
+        pile = in_float64(heap())
+
         def cost(plan, error):
-            total = rollout(fake_world, in_float64(heap()), plan).performance
+            total = rollout(fake_world, pile, plan).performance
             value = (total.mass + total.time + total.work / 100.0).sum()
             return value + error * (value - jax.lax.stop_gradient(value))
 

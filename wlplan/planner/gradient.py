@@ -23,7 +23,7 @@ class GradientSettings:
 
     # Plans that are optimised side by side: greedy, nominal, and perturbations of the first.
     starts: int = 6
-    iterations: int = 48
+    iterations: int = 40
     # Largest step of an iteration: along the contour [m], heading offset and action before
     # squashing.
     step_position: float = 0.12
@@ -38,6 +38,8 @@ class GradientSettings:
     candidates: int = 16
     snapshot_every: int = 8
     search: SearchSettings = DEFAULT_SEARCH
+    # Steps of Adam on the nominal plan, which is only a start here.
+    nominal_steps: int = 6
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
@@ -89,7 +91,8 @@ def gradient(
     """
     search = dataclasses.replace(settings.search, rows=settings.starts)
     base = greedy(job, loads, seed=seed, settings=search, progress=progress)
-    even = nominal(job, loads, seed=seed, settings=search, progress=progress)
+    quick = dataclasses.replace(search, refine_steps=settings.nominal_steps)
+    even = nominal(job, loads, seed=seed, settings=quick, progress=progress)
     length = contour_length(job)
     rng = np.random.default_rng([seed, 1])
     rows = [base, even, *(_perturbed(base, length, rng, settings) for _ in range(settings.starts))]
