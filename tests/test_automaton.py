@@ -192,9 +192,7 @@ def test_gradient_of_sweeps_against_finite_differences():
     with jax.enable_x64(True):
         height = jnp.asarray(np.asarray(rough(shape=(10, 9))), jnp.float64)
         weight = jnp.asarray(np.random.default_rng(0).normal(size=height.shape))
-        assert_gradient(
-            lambda h: (weight * sweeps(h, DROP, None, 30)).sum(), height, relative=1e-5
-        )
+        assert_gradient(lambda h: (weight * sweeps(h, DROP, None, 30)).sum(), height, relative=1e-5)
 
 
 def test_gradient_of_settling_against_finite_differences_with_mask_and_floor():
@@ -229,7 +227,7 @@ def test_gradient_stays_bounded_over_many_sweeps():
 
 def test_gradient_is_finite_on_flat_ground():
     for height in (jnp.zeros((16, 16)), jnp.full((16, 16), 2.0)):
-        gradient = jax.grad(
-            lambda h: (settle(h, cell_size=0.1, repose_angle=REPOSE) ** 2).sum()
-        )(height)
+        gradient = jax.grad(lambda h: (settle(h, cell_size=0.1, repose_angle=REPOSE) ** 2).sum())(
+            height
+        )
         assert jnp.isfinite(gradient).all()

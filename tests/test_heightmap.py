@@ -43,9 +43,7 @@ def bumpy(shape=(120, 110), seed=0, dtype=jnp.float32):
 def test_sampling_reproduces_a_plane_and_repeats_the_border():
     pile = plane(0.3, -0.2)
     x, y = jnp.asarray([0.123, 2.77, -2.95]), jnp.asarray([1.01, -1.93, 4.0])
-    np.testing.assert_allclose(
-        sample(pile.height, pile, x, y), 0.3 * x - 0.2 * y + 0.3, atol=1e-5
-    )
+    np.testing.assert_allclose(sample(pile.height, pile, x, y), 0.3 * x - 0.2 * y + 0.3, atol=1e-5)
     far = sample(pile.height, pile, jnp.asarray([-50.0]), jnp.asarray([-2.0]))
     np.testing.assert_allclose(far, pile.height[0, 0], atol=1e-6)
 

@@ -229,7 +229,6 @@ def test_gradient_of_five_loadings_against_finite_differences(low, cone):
 def test_the_gradient_check_can_fail():
     """A gradient that is a thousandth too long does not pass."""
     with jax.enable_x64(True):
-
         pile = in_float64(heap())
 
         def cost(plan, error):
