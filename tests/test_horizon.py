@@ -10,6 +10,7 @@ from laws import assert_gradient
 
 import wlplan
 from wlplan.automaton import relax
+from wlplan.compilation import jit_small_loops
 from wlplan.horizon import closed_loop, rollout
 from wlplan.machine import GRAVEL
 from wlplan.objective import OBJECTIVES, loading_cost
@@ -246,7 +247,7 @@ def test_the_gradient_check_can_fail():
 def gradient_of_one(low):
     """Gradient of the cost of two loadings with respect to plan and heights."""
 
-    @jax.jit
+    @jit_small_loops
     def run(height, origin, plan):
         def cost(plan, height):
             return cost_in(low, Pile(height, 0.1, origin))(plan)

@@ -94,6 +94,7 @@ def sweep(
     active: Bool[Array, "nx ny"] | None = None,
     *,
     largest: float | None = None,
+    giving: Float[Array, "nx ny"] | None = None,
 ) -> Float[Array, "nx ny"]:
     """One sweep of the automaton.
 
@@ -103,6 +104,7 @@ def sweep(
         active: Cells that take part; None: all.
         largest: Largest excess height that counts [m]; bounds the flow where a sweep stands for
             a span of time; None: no bound.
+        giving: Part of its outflow that each cell lets go; None: all.
     """
     outflow = jnp.zeros_like(height)
     for i, j in _NEIGHBOURS:
@@ -111,6 +113,8 @@ def sweep(
         flow = difference - jnp.clip(difference, -limit, limit)
         if largest is not None:
             flow = jnp.clip(flow, -largest, largest)
+        if giving is not None:
+            flow = flow * jnp.where(flow > 0.0, giving, _neighbour(giving, i, j))
         if active is not None:
             flow = jnp.where(active & _neighbour(active, i, j), flow, 0.0)
         outflow = outflow + flow

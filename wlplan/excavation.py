@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 from wlplan.heightmap import cell_centres, take, to_local
 from wlplan.types import Pile, Pose
 
-# How steeply the cut rises behind the penetration. Fitted: bucket tips in the simulator leave the
-# floor and rise at about this angle.
+# How steeply the cut rises behind the penetration. Estimate: buckets leave the floor and curl up
+# about so; the automaton evens out the rest.
 _RISE = math.tan(math.radians(45.0))
 # The strip ends here [m]: the largest penetration, 3.2 m (paper, section 5.2), and the rise of a
 # bucket that breaks out.

@@ -100,9 +100,10 @@ def v_turn_length(
     turn_x = start_x - chord * jnp.cos(pose.heading + deviation)
     turn_y = start_y - chord * jnp.sin(pose.heading + deviation)
     dx, dy = receiver.x - turn_x, receiver.y - turn_y
-    # The offset keeps the derivative finite where the turning point meets the receiver.
+    # Where the turning point meets the receiver, distance and bearing have no derivative.
     distance = jnp.sqrt(dx**2 + dy**2 + 1e-4)
-    bearing = jnp.arctan2(dy, dx)
+    meets = (dx == 0.0) & (dy == 0.0)
+    bearing = jnp.arctan2(dy, jnp.where(meets, 1.0, dx))
     lengths = (
         arc
         + distance

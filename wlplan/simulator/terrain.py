@@ -175,7 +175,10 @@ def move(
     # A whole sweep stands for _SLIDE_TIME, a shorter step for its share of one.
     share = step / _SLIDE_TIME
     largest = soil.slide_rate * _SLIDE_TIME / (FLOW_FRACTION * CELL_SIZE)
-    slid = sweep(surface, CELL_SIZE * math.tan(soil.friction), largest=largest)
+    drop = CELL_SIZE * math.tan(soil.friction)
+    # A layer thinner than a cell gives in proportion, so none gives what it does not have.
+    giving = (1.0 - occupied) * jnp.clip((height - ground) / CELL_SIZE, 0.0, 1.0)
+    slid = sweep(surface, drop, largest=largest, giving=giving)
     change = share * (slid - surface)
     into_bucket = occupied * open_part[None, :] * jnp.maximum(change, 0.0)
     height = height + change - into_bucket
