@@ -325,10 +325,6 @@ def test_the_local_ledger_closes(digs):
     np.testing.assert_allclose(lost * 0.01 * GRAVEL.density, cycle.mass, rtol=2e-5)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="cells inside the bucket stand at the level of its mouth and give from there",
-)
 def test_the_local_surface_stays_above_the_ground(digs):
     rng = np.random.default_rng(3)
     cycle = digs([bumpy(k) for k in range(20)], random_actions(rng, 20))

@@ -75,7 +75,7 @@ def earthmoving_force(
     return jnp.maximum(resistance(jnp.sin(beta), jnp.cos(beta)), 0.0)
 
 
-def _failure_angle(resistance: Callable[[float, float], Array]) -> Array:
+def _failure_angle(resistance: Callable[[Array | float, Array | float], Array]) -> Array:
     """The angle of least resistance; by the envelope theorem a constant for the derivative."""
     values = [resistance(math.sin(b), math.cos(b)) for b in _FAILURE_ANGLES]
     before, here, after = values[0], values[1], values[2]
