@@ -491,11 +491,13 @@ def derivatives():
         )
 
 
+@pytest.mark.slow
 def test_the_differentiable_setting_gives_the_same_outcome(derivatives):
     fixed, default, _, _ = derivatives
     np.testing.assert_allclose(fixed, default, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_against_finite_differences(derivatives):
     _, _, gradient, central = derivatives
     size = np.linalg.norm(central, axis=-1)
@@ -504,6 +506,7 @@ def test_gradients_against_finite_differences(derivatives):
     np.testing.assert_array_less(error, 5e-3 * size)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_where_there_is_nothing_to_dig(derivatives):
     _, _, gradient, _ = derivatives
     assert np.isfinite(gradient).all()

@@ -84,6 +84,9 @@ def test_the_failure_angle_of_the_oracle():
         GRAVEL,
         dataclasses.replace(GRAVEL, cohesion=10e3, adhesion=5e3),
         dataclasses.replace(GRAVEL, density=1500.0, cohesion=1e3),
+        # Steep friction brings the wedge close to locking.
+        dataclasses.replace(GRAVEL, friction=math.radians(38.0)),
+        dataclasses.replace(GRAVEL, friction=math.radians(42.0)),
     ],
 )
 @pytest.mark.parametrize("surcharge", [0.0, 5e3])

@@ -69,7 +69,9 @@ def earthmoving_force(
         force = load * (cot_rake + cos_beta / sin_beta) * lift
         force = force + soil.cohesion * depth * cos_phi / sin_beta
         force = force - soil.adhesion * depth * cosine / sin_rake
-        return force / jnp.maximum(sin_eta, _LOCKED)
+        # Beyond locking the wedge cannot be pushed out at all: no such angle may look cheap.
+        beyond = jnp.maximum(_LOCKED - sin_eta, 0.0) / _LOCKED
+        return force / jnp.maximum(sin_eta, _LOCKED) * (1.0 + beyond)
 
     beta = lax.stop_gradient(_failure_angle(resistance))
     return jnp.maximum(resistance(jnp.sin(beta), jnp.cos(beta)), 0.0)
