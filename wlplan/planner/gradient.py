@@ -36,7 +36,7 @@ class GradientSettings:
     # How many plans are handed on for a referee to choose from, and how often one is taken from
     # each start as the iterations go.
     candidates: int = 16
-    snapshot_every: int = 8
+    snapshot_every: int = 4
     search: SearchSettings = DEFAULT_SEARCH
     # Steps of Adam on the nominal plan, which is only a start here.
     nominal_steps: int = 6
@@ -85,9 +85,8 @@ def gradient(
         progress: Called after each iteration with the best cost so far.
 
     Returns:
-        Up to `settings.candidates` plans, leaves [K, N], in the order of their cost. The greedy
-        plan is a start and every visited plan counts, so the first costs at most what greedy does;
-        the last is the greedy plan itself.
+        `settings.candidates` plans, leaves [K, N], in the order of their cost, none dearer
+        than the greedy plan, which is the last.
     """
     search = dataclasses.replace(settings.search, rows=settings.starts)
     base = greedy(job, loads, seed=seed, settings=search, progress=progress)
@@ -118,8 +117,13 @@ def gradient(
         if k < settings.iterations:
             decisions, state = _update(gradients, state, decisions, length, settings=settings)
     pool = sorted([*zip(best_costs.tolist(), best, strict=True), *kept], key=lambda pair: pair[0])
-    chosen = [plan for _, plan in pool[: settings.candidates - 1]]
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *chosen, base)
+    # The first row starts as the greedy plan. What is dearer than that is no candidate; of the
+    # rest an even choice, since the cheapest plans are also those that exploit the model most.
+    limit = next(cost for cost, _ in kept)
+    cheap = [plan for cost, plan in pool if cost <= limit]
+    # Always the same number, repeats included: what plays them is compiled for it.
+    picks = np.linspace(0, len(cheap) - 1, settings.candidates - 1).round().astype(int)
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *[cheap[k] for k in picks], base)
 
 
 def _perturbed(
