@@ -29,7 +29,7 @@ KIND, SLOPE_DEGREES, SEED, LOADS = "conical", 30.0, 1, 10
 def run(preset: str) -> dict[str, Any]:
     """Starts from the greedy plan and improves it by trial in the simulator."""
     smoke = preset == "smoke"
-    loads, rounds, batch = (2, 2, 4) if smoke else (LOADS, 80, 24)
+    loads, rounds, batch = (2, 2, 4) if smoke else (LOADS, 45, 16)
     search = SearchSettings(actions=6, refine_steps=2, poses_per_metre=0.3, rows=2)
     pile = wlplan.relax(wlplan.seed_pile(KIND, slope=math.radians(SLOPE_DEGREES), seed=SEED))
     job = ToeJob(
