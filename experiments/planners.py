@@ -35,7 +35,7 @@ def run(preset: str) -> dict[str, Any]:
     for kind in kinds:
         pile = wlplan.relax(wlplan.seed_pile(kind, slope=math.radians(SLOPE_DEGREES), seed=SEED))
         for planner in reversed(PLANNERS):
-            for referee in (None, simulator) if planner == "gradient" else (None,):
+            for referee in (None, simulator):
                 start = time.perf_counter()
                 plan = wlplan.plan_loads(
                     low,

@@ -177,12 +177,22 @@ def test_a_referee_has_the_last_word_among_the_candidates():
     alone = plan_loads(bowl_world, cone(), **options)
     judged = plan_loads(bowl_world, cone(), referee=contrary, **options)
     greedy = plan_loads(
-        bowl_world, cone(), loads=2, planner="greedy", settings=SEARCH, contour=circle()
+        bowl_world,
+        cone(),
+        loads=2,
+        planner="greedy",
+        settings=SEARCH,
+        contour=circle(),
+        referee=contrary,
     )
     assert alone.refereed is None
-    assert judged.refereed.cost <= play(contrary, cone(), alone.plan).cost * (1 + 1e-6)
-    assert judged.refereed.cost <= play(contrary, cone(), greedy.plan).cost * (1 + 1e-6)
+    # The greedy plan is among the candidates, and the limit in the planner's own world.
+    assert judged.refereed.cost <= greedy.refereed.cost * (1 + 1e-6)
     assert judged.cost <= greedy.cost * (1 + 1e-5)
+    # What the referee saw is the plan, with the poses of the result.
+    again = play(contrary, cone(), judged.plan)
+    assert float(again.cost) == pytest.approx(float(judged.refereed.cost), rel=1e-5)
+    assert float(judged.refereed.cost) != float(judged.cost)
 
 
 def test_bad_requests_are_refused():

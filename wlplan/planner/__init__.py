@@ -69,9 +69,10 @@ def plan_loads(
         planner: One of `PLANNERS`.
         receiver: Where the loads go; default: the follow-up's place relative to the pile.
         seed: Of everything random.
-        referee: World that plays the planner's best candidates, poses as planned, and picks the
-            cheapest; a candidate that `world` finds dearer than the planner's last, for the
-            gradient planner the greedy plan, is out. None: `world` picks.
+        referee: World that plays the planner's best candidates, each dig at the toe of the pile
+            as the referee has it by then, and picks the cheapest; the poses of the result are the
+            ones it dug at. A candidate that `world` finds dearer than the planner's last, for the
+            gradient planner the greedy plan, is out. None: `world` picks, with its own poses.
         progress: Called as the planner advances.
         settings: Of the planner; default: its own, or `WITHOUT_GRADIENT` in the simulator.
         contour: The toe to dig along; default: that of the pile.
@@ -104,12 +105,13 @@ def plan_loads(
         settings = WITHOUT_GRADIENT if settings is None else settings
     options: dict[str, Any] = {} if settings is None else {"settings": settings}
     candidates = _PLANNERS[planner](job, loads, seed=seed, progress=progress, **options)
-    seen = outcomes(job, candidates)
-    costs = np.asarray(seen.cost)
     if referee is None:
-        return _member(seen, int(np.nanargmin(costs)))
-    judge = Job(_as_pytree(referee), pile, job.receiver, job.objective)
-    judged = played(judge, seen.plan)
+        seen = outcomes(job, candidates)
+        return _member(seen, int(np.nanargmin(np.asarray(seen.cost))))
+    # The toe is where the referee's pile begins, so the poses are the ones it was played with.
+    judged = outcomes(job.replace(world=_as_pytree(referee)), candidates)
+    seen = played(Job(job.world, pile, job.receiver, job.objective), judged.plan)
+    costs = np.asarray(seen.cost)
     # Rounding may put a plan that is its own limit above it.
     allowed = costs <= costs[-1] * (1.0 + 1e-6)
     winner = int(np.nanargmin(np.where(allowed, np.asarray(judged.cost), np.inf)))
