@@ -136,10 +136,15 @@ def outcomes(job: ToeJob, plans: Decisions) -> Outcome:
     return jax.vmap(lambda decisions: play_decisions(job, decisions))(plans)
 
 
-@jax.jit
-def played(job: Job, plans: LoadingPlan) -> Outcome:
-    """Plays several fixed plans; leaves [K, N]."""
+def _played(job: Job, plans: LoadingPlan) -> Outcome:
     return jax.vmap(lambda plan: play_plan(job, plan))(plans)
+
+
+played = jax.jit(_played)
+"""Plays several fixed plans; leaves [K, N]."""
+
+played_in_model = jit_small_loops(_played)
+"""The same, compiled for a world that is a model."""
 
 
 def _costs_and_gradients(job: ToeJob, plans: Decisions) -> tuple[Float[Array, " k"], Decisions]:

@@ -103,7 +103,7 @@ def _refine_starts(
 _refine = jit_small_loops(_refine_starts, static_argnames=("steps", "rate"))
 
 
-@jax.jit
+@jit_small_loops
 def _advance(job: ToeJob, pile: Pile, decisions: Decisions) -> Pile:
     return job.world(pile, *decide(job, pile, decisions))[0]
 
