@@ -3,29 +3,40 @@
 One sweep moves, along every edge between neighbouring cells i and k at distance d, the height
 f * max(h_i - h_k - d tan(repose), 0) from the higher to the lower cell (eight neighbours). The
 flow is antisymmetric, so volume is kept by construction; with f = 1/8 the Jacobian of a sweep is
-symmetric, has unit row sums and is non-expansive, so its gradient cannot explode. This is our
-reading of the mass-preserving automaton of Pla-Castells et al. (2004), which the paper employs
-(section 4.6), with eight neighbours in place of four.
+symmetric, not negative and has unit row sums, so a sweep is monotone, non-expansive in every
+p-norm, and its gradient cannot explode. This is our reading of the mass-preserving automaton of
+Pla-Castells et al. (2004), which the paper employs (section 4.6), with eight neighbours in place
+of four. `sweeps` and `converged` are this automaton as it stands.
 
-Sweeps alone converge slowly over long distances, so `settle` runs them coarse to fine: heights are
-averaged onto a grid of twice the spacing, relaxed there, and the change is interpolated back. A
-relaxed surface is relaxed on every level, so `settle` does not move it.
+Sweeps alone take thousands to bring a bucket's hole to rest. `settle` gets there in dozens:
 
-Gradients: reverse mode with respect to the height, by a rule of our own that stores one height a
-sweep; forward mode is not available, and the floor and the repose angle count as constants.
+- Coarse to fine. Heights are averaged onto grids of twice and four times the spacing, relaxed
+  there first, and the change is interpolated back with its volume kept. A surface that is relaxed
+  is relaxed on every level, so `settle` does not move it.
+- Momentum. A sweep is a step of gradient descent on the energy sum max(excess, 0)^2 / 2, and the
+  heavy-ball method speeds that up. It starts anew as soon as its velocity points uphill, which
+  keeps it from overshooting.
+- Rounds of both are repeated until the steepest slope is within a tolerance, and no more.
+
+Gradients: reverse mode with respect to the height, exact for the sweeps that were made, by rules
+of our own. Forward mode is not available (JAX says so), and the floor and the angle of repose
+count as constants.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt8
 
 from wlplan.machine import GRAVEL
 from wlplan.types import Pile, Pose
@@ -34,15 +45,25 @@ from wlplan.types import Pile, Pose
 # largest value at which a sweep is non-expansive.
 FLOW_FRACTION = 0.125
 
+# Bit k of a cell's links stands for neighbour k.
 _NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
+_BITS = tuple(np.uint8(1 << k) for k in range(len(_NEIGHBOURS)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
-    """How hard `settle` works: `cycles` passes of `sweeps[k]` sweeps at spacing 2^k."""
+    """How `settle` works: rounds of `sweeps[k]` sweeps at spacing 2^k, coarse to fine.
 
-    cycles: int = 3
-    sweeps: tuple[int, ...] = (16, 24, 48, 48)
+    The defaults are the quickest that were found for bucket loads, see docs/automaton.md.
+    """
+
+    sweeps: tuple[int, ...] = (12, 16, 20)
+    # Part of the velocity that is kept from sweep to sweep.
+    momentum: float = 0.9
+    # How much steeper than the angle of repose the result may be [rad].
+    tolerance: float = math.radians(1.0)
+    # It gives up after this many rounds. Bucket loads take two or three.
+    most_rounds: int = 12
 
     @property
     def block(self) -> int:
@@ -53,39 +74,29 @@ class Schedule:
 DEFAULT_SCHEDULE = Schedule()
 
 
-class Terrain(NamedTuple):
+class _Terrain(NamedTuple):
     """What limits the flow: the floor [m] (None: level 0) and the cells that take part (None: all).
 
     A cell whose floor is itself steeper than the angle of repose (a kerb, a wall) must not take
-    part; among the others nothing then slides below the floor, see `terrain_of`.
+    part; among the others nothing then slides below the floor.
     """
 
-    ground: Float[Array, "nx ny"] | None = None
-    active: Bool[Array, "nx ny"] | None = None
+    ground: Array | None
+    active: Array | None
 
 
-OPEN_TERRAIN = Terrain()
-"""A level floor at 0, and every cell takes part."""
+# --- one sweep
 
 
-def _neighbour(field: Array, i: int, j: int) -> Array:
-    """The value of the neighbour at offset (i, j) of every cell; mirrored at the border."""
-    for axis, step in ((0, i), (1, j)):
-        n = field.shape[axis]
-        if step == 1:
-            parts = [
-                lax.slice_in_dim(field, 1, n, axis=axis),
-                lax.slice_in_dim(field, n - 1, n, axis=axis),
-            ]
-        elif step == -1:
-            parts = [
-                lax.slice_in_dim(field, 0, 1, axis=axis),
-                lax.slice_in_dim(field, 0, n - 1, axis=axis),
-            ]
-        else:
-            continue
-        field = lax.concatenate(parts, axis)
-    return field
+def _rim(field: Array) -> Array:
+    """The field with its border mirrored, one cell all around."""
+    return jnp.pad(field, 1, mode="edge")
+
+
+def _around(rimmed: Array, i: int, j: int) -> Array:
+    """The value of the neighbour at offset (i, j) of every cell inside the rim."""
+    n, m = rimmed.shape
+    return lax.slice(rimmed, (1 + i, 1 + j), (n - 1 + i, m - 1 + j))
 
 
 def sweep(
@@ -106,88 +117,221 @@ def sweep(
             a span of time; None: no bound.
         giving: Part of its outflow that each cell lets go; None: all.
     """
+    around = _rim(height)
+    giving_around = None if giving is None else _rim(giving)
+    links = None if active is None else _links(active)
     outflow = jnp.zeros_like(height)
-    for i, j in _NEIGHBOURS:
-        limit = drop * math.hypot(i, j)
-        difference = height - _neighbour(height, i, j)
-        flow = difference - jnp.clip(difference, -limit, limit)
+    for (i, j), bit in zip(_NEIGHBOURS, _BITS, strict=True):
+        flow = _excess(height, _around(around, i, j), drop * math.hypot(i, j))
         if largest is not None:
             flow = jnp.clip(flow, -largest, largest)
         if giving is not None:
-            flow = flow * jnp.where(flow > 0.0, giving, _neighbour(giving, i, j))
-        if active is not None:
-            flow = jnp.where(active & _neighbour(active, i, j), flow, 0.0)
-        outflow = outflow + flow
+            flow = flow * jnp.where(flow > 0.0, giving, _around(giving_around, i, j))
+        outflow = outflow + (flow if links is None else jnp.where(links & bit != 0, flow, 0.0))
     return height - FLOW_FRACTION * outflow
 
 
-def _sweep_jacobian(
-    vector: Float[Array, "nx ny"],
-    height: Float[Array, "nx ny"],
-    drop: float,
-    active: Bool[Array, "nx ny"] | None,
-) -> Float[Array, "nx ny"]:
-    """The Jacobian of `sweep` at `height`, which is symmetric, applied to a vector."""
-    outflow = jnp.zeros_like(vector)
-    for i, j in _NEIGHBOURS:
-        limit = drop * math.hypot(i, j)
-        slides = jnp.abs(height - _neighbour(height, i, j)) > limit
-        if active is not None:
-            slides = slides & active & _neighbour(active, i, j)
-        outflow = outflow + jnp.where(slides, vector - _neighbour(vector, i, j), 0.0)
-    return vector - FLOW_FRACTION * outflow
+def _excess(height: Array, neighbour: Array, limit: float) -> Array:
+    """How much of a height difference is more than is stable, with its sign."""
+    difference = height - neighbour
+    return difference - jnp.clip(difference, -limit, limit)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(1, 3))
+def _links(active: Array) -> UInt8[Array, "nx ny"]:
+    """Which neighbours each cell can exchange soil with, as bits: both have to take part."""
+    around = _rim(active)
+    packed = jnp.zeros(active.shape, jnp.uint8)
+    for (i, j), bit in zip(_NEIGHBOURS, _BITS, strict=True):
+        packed = packed | jnp.where(active & _around(around, i, j), bit, np.uint8(0))
+    return packed
+
+
+def _outflow(rimmed: Array, drop: float, links: Array | None) -> Array:
+    """Excess height towards all neighbours together; input with a rim, output without."""
+    height = _around(rimmed, 0, 0)
+    total = jnp.zeros_like(height)
+    for (i, j), bit in zip(_NEIGHBOURS, _BITS, strict=True):
+        flow = _excess(height, _around(rimmed, i, j), drop * math.hypot(i, j))
+        total = total + (flow if links is None else jnp.where(links & bit != 0, flow, 0.0))
+    return total
+
+
+def _spread(vector: Array, rimmed: Array, drop: float, links: Array | None) -> Array:
+    """The Jacobian of `_outflow` at a surface, which is symmetric, applied to a vector.
+
+    Both inputs with a rim, the output without.
+    """
+    height, centre = _around(rimmed, 0, 0), _around(vector, 0, 0)
+    total = jnp.zeros_like(centre)
+    for (i, j), bit in zip(_NEIGHBOURS, _BITS, strict=True):
+        slides = jnp.abs(height - _around(rimmed, i, j)) > drop * math.hypot(i, j)
+        if links is not None:
+            slides = slides & (links & bit != 0)
+        total = total + jnp.where(slides, centre - _around(vector, i, j), 0.0)
+    return total
+
+
+# --- many sweeps
+
+
+# Surfaces that reverse mode keeps at once.
+_KEPT = 64
+
+
 def sweeps(
     height: Float[Array, "nx ny"],
     drop: float,
     active: Bool[Array, "nx ny"] | None,
     count: int,
 ) -> Float[Array, "nx ny"]:
-    """`count` sweeps in a row: the automaton as the paper has it. Arguments as for `sweep`."""
-    return lax.fori_loop(0, count, lambda _, h: sweep(h, drop, active), height)
+    """`count` sweeps in a row: the automaton as the paper has it. Arguments as for `sweep`.
+
+    Reverse mode keeps at most 128 surfaces up to a count of 4,096, and 64 more with every further
+    factor of 64; the sweeps in between it makes again.
+    """
+    return _many_sweeps(height, None if active is None else _links(active), drop, count)
 
 
-def _sweeps_forward(height: Array, drop: float, active: Array | None, count: int):
-    def step(h: Array, _: None):
-        return sweep(h, drop, active), h
+def _many_sweeps(height: Array, links: Array | None, drop: float, count: int) -> Array:
+    if count <= _KEPT:
+        return _slide(height, links, drop, 0.0, count)
+    part = 1
+    while part * _KEPT < count:
+        part *= _KEPT
 
-    height, history = lax.scan(step, height, None, length=count)
-    return height, (history, active)
+    @jax.checkpoint
+    def block(h: Array, _: None) -> tuple[Array, None]:
+        return _many_sweeps(h, links, drop, part), None
 
-
-def _sweeps_backward(drop: float, count: int, residuals, cotangent: Array):
-    history, active = residuals
-
-    def step(c: Array, h: Array):
-        return _sweep_jacobian(c, h, drop, active), None
-
-    cotangent, _ = lax.scan(step, cotangent, history, reverse=True)
-    return cotangent, None
+    blocks, rest = divmod(count, part)
+    height, _ = lax.scan(block, height, None, length=blocks)
+    return _many_sweeps(height, links, drop, rest) if rest else height
 
 
-sweeps.defvjp(_sweeps_forward, _sweeps_backward)
+@partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
+def _slide(
+    height: Float[Array, "nx ny"],
+    links: UInt8[Array, "nx ny"] | None,
+    drop: float,
+    momentum: float,
+    count: int,
+) -> Float[Array, "nx ny"]:
+    """`count` sweeps from standstill, each as far as the last and further: the heavy-ball method.
+
+    The velocity is dropped when it points uphill, against what the sweep itself would do.
+    """
+
+    def step(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        rimmed, velocity = state
+        flow = -FLOW_FRACTION * _outflow(rimmed, drop, links)
+        velocity = _kept_part(momentum, flow, velocity) * velocity + flow
+        return _rim(_around(rimmed, 0, 0) + velocity), velocity
+
+    def plain(_: Array, rimmed: Array) -> Array:
+        return _rim(_around(rimmed, 0, 0) - FLOW_FRACTION * _outflow(rimmed, drop, links))
+
+    if momentum == 0.0:
+        return _around(lax.fori_loop(0, count, plain, _rim(height)), 0, 0)
+    rimmed, _ = lax.fori_loop(0, count, step, (_rim(height), jnp.zeros_like(height)))
+    return _around(rimmed, 0, 0)
+
+
+def _kept_part(momentum: float, flow: Array, velocity: Array) -> Array:
+    uphill = jnp.vdot(flow, velocity) < 0.0
+    return jnp.where(uphill, jnp.zeros((), flow.dtype), jnp.asarray(momentum, flow.dtype))
+
+
+def _slide_forward(height: Array, links: Array | None, drop: float, momentum: float, count: int):
+    def step(state: tuple[Array, Array], _: None):
+        rimmed, velocity = state
+        flow = -FLOW_FRACTION * _outflow(rimmed, drop, links)
+        kept = _kept_part(momentum, flow, velocity)
+        velocity = kept * velocity + flow
+        return (_rim(_around(rimmed, 0, 0) + velocity), velocity), (rimmed, kept)
+
+    start = (_rim(height), jnp.zeros_like(height))
+    (rimmed, _), record = lax.scan(step, start, None, length=count)
+    return _around(rimmed, 0, 0), (*record, links)
+
+
+def _slide_backward(drop: float, momentum: float, count: int, record, cotangent: Array):
+    surfaces, kept, links = record
+
+    # `both` is the cotangent of a sweep's velocity: that of the next velocity and of the surface.
+    # Carried with its rim, as the flow is: XLA makes far slower code of the other ways tried.
+    def step(state: tuple[Array, Array], recorded: tuple[Array, Array]):
+        height, both = state
+        surface, kept = recorded
+        height = height - FLOW_FRACTION * _rim(_spread(both, surface, drop, links))
+        return (height, kept * both + height), None
+
+    start = (_rim(cotangent), _rim(cotangent))
+    (height, _), _ = lax.scan(step, start, (surfaces, kept), reverse=True)
+    return _around(height, 0, 0), None
+
+
+_slide.defvjp(_slide_forward, _slide_backward)
+
+
+def converged(
+    pile: Pile,
+    *,
+    repose_angle: float = GRAVEL.repose_angle,
+    tolerance: float = math.radians(0.01),
+    most_sweeps: int = 100_000,
+) -> Pile:
+    """The paper's automaton, sweep after sweep until it rests: the slow reference of `relax`.
+
+    Args:
+        pile: Any pile.
+        repose_angle: Angle of repose [rad].
+        tolerance: How much steeper than `repose_angle` the result may be [rad].
+        most_sweeps: It gives up after this many.
+
+    Returns:
+        The relaxed pile. Not differentiable.
+    """
+    active = movable(pile, repose_angle)
+    limit = pile.cell_size * math.tan(repose_angle + tolerance)
+    drop = pile.cell_size * math.tan(repose_angle)
+    every = 100
+
+    def steep(state: tuple[Array, Array]) -> Array:
+        height, count = state
+        return (count < most_sweeps) & _steeper_than(limit, height, active)
+
+    def more(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        height, count = state
+        return sweeps(height, drop, active, every), count + every
+
+    height, _ = lax.while_loop(steep, more, (pile.height, jnp.zeros((), jnp.int32)))
+    return pile.replace(height=height)
+
+
+# --- coarse to fine
 
 
 def _coarsen(field: Array) -> Array:
-    n, m = field.shape
-    return field.reshape(n // 2, 2, m // 2, 2).mean((1, 3))
+    # Strided slices: XLA's reduction over the same cells takes five times as long on a CPU.
+    rows = field[::2] + field[1::2]
+    return 0.25 * (rows[:, ::2] + rows[:, 1::2])
 
 
 def _refine(field: Array) -> Array:
     """Bilinear interpolation to half the spacing, cell-centred; keeps the volume exactly."""
     for axis in (0, 1):
-        step = (1, 0) if axis == 0 else (0, 1)
-        low = 0.75 * field + 0.25 * _neighbour(field, -step[0], -step[1])
-        high = 0.75 * field + 0.25 * _neighbour(field, *step)
+        widths = [(1, 1) if k == axis else (0, 0) for k in (0, 1)]
+        around = jnp.pad(field, widths, mode="edge")
+        n = field.shape[axis]
+        low = 0.75 * field + 0.25 * lax.slice_in_dim(around, 0, n, axis=axis)
+        high = 0.75 * field + 0.25 * lax.slice_in_dim(around, 2, n + 2, axis=axis)
         shape = list(field.shape)
         shape[axis] *= 2
         field = jnp.stack([low, high], axis=axis + 1).reshape(shape)
     return field
 
 
-def _add_change(height: Array, change: Array, terrain: Terrain) -> Array:
+def _add_change(height: Array, change: Array, terrain: _Terrain) -> Array:
     """Adds a change of zero net volume, without digging under the floor or moving unseen cells."""
     ground, active = terrain
     floor = jnp.zeros_like(height) if ground is None else ground
@@ -203,72 +347,74 @@ def _add_change(height: Array, change: Array, terrain: Terrain) -> Array:
     return height - jnp.where(moves, loss, 0.0) + scale * gain
 
 
-def _cycle(height: Array, drop: float, terrain: Terrain, counts: tuple[int, ...]) -> Array:
-    if len(counts) > 1:
-        ground, active = terrain
+def _round(height: Array, terrain: _Terrain, drop: float, schedule: Schedule, level: int) -> Array:
+    """Coarser levels first, then the sweeps of this one."""
+    ground, active = terrain
+    if level + 1 < len(schedule.sweeps):
         coarse = _coarsen(height)
-        coarse_terrain = Terrain(
+        coarse_terrain = _Terrain(
             None if ground is None else _coarsen(ground),
             # A coarse cell takes part when all of its cells do.
             None if active is None else _coarsen(active.astype(height.dtype)) == 1.0,
         )
-        relaxed = _cycle(coarse, 2.0 * drop, coarse_terrain, counts[1:])
+        relaxed = _round(coarse, coarse_terrain, 2.0 * drop, schedule, level + 1)
         height = _add_change(height, _refine(relaxed - coarse), terrain)
-    return sweeps(height, drop, terrain.active, counts[0])
+    links = None if active is None else _links(active)
+    slid = _slide(height, links, drop, schedule.momentum, schedule.sweeps[level])
+    # A sweep stops at the floor; its momentum might not.
+    return _add_change(height, slid - height, terrain) if schedule.momentum else slid
 
 
 def settle(
-    height: Float[Array, "nx ny"],
+    pile: Pile,
     *,
-    cell_size: float,
-    repose_angle: float,
-    terrain: Terrain = OPEN_TERRAIN,
+    repose_angle: float = GRAVEL.repose_angle,
     schedule: Schedule = DEFAULT_SCHEDULE,
-) -> Float[Array, "nx ny"]:
-    """Relaxes a disturbed surface, coarse to fine, with a fixed amount of work.
+) -> Pile:
+    """Relaxes a disturbed pile until it is within the schedule's tolerance.
+
+    Slopes of the floor itself, where no soil lies on it, are not changed, nor are unseen cells.
 
     Args:
-        height: Surface [m]; both sides a multiple of `schedule.block` cells.
-        cell_size: Grid spacing [m].
+        pile: Any pile.
         repose_angle: Angle of repose [rad].
-        terrain: Floor and mask; the default floor is level 0, which needs no limit.
-        schedule: Number of cycles and sweeps.
+        schedule: Sweeps, tolerance, and when to give up.
 
     Returns:
-        A surface of the same volume. How far it is from the angle of repose, `steepest_slope`
-        tells; after a bucket load the default schedule leaves it within about 2 degrees.
-
-    Raises:
-        ValueError: If a side is not a multiple of `schedule.block`.
+        A pile of the same volume; the same pile if it was within the tolerance. Differentiable in
+        `pile.height` by reverse mode, whose memory is one surface a round and what a single round
+        leaves. Under `vmap` every member makes its own number of rounds on the CPU, one after the
+        other; on other devices all make as many as the slowest.
     """
-    if any(n % schedule.block for n in height.shape):
-        raise ValueError(
-            f"The grid of {height.shape[0]} x {height.shape[1]} cells must be a multiple of "
-            f"{schedule.block} cells a side. Pad it, or use fewer levels in the schedule."
-        )
-    drop = cell_size * math.tan(repose_angle)
-
-    # A scan, so that the cycles share one compiled body.
-    def cycle(h: Array, _: None) -> tuple[Array, None]:
-        return _cycle(h, drop, terrain, schedule.sweeps), None
-
-    return lax.scan(cycle, height, None, length=schedule.cycles)[0]
+    return _settled(pile, None, jnp.zeros(2, jnp.int32), repose_angle, schedule)
 
 
-def steepest_slope(pile: Pile) -> Float[Array, ""]:
-    """Steepest slope between any two neighbouring cells that were seen [rad]."""
-    steepest = jnp.zeros((), pile.height.dtype)
-    for i, j in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        rise = jnp.abs(pile.height - _neighbour(pile.height, i, j)) / math.hypot(i, j)
-        if pile.valid is not None:
-            rise = jnp.where(pile.valid & _neighbour(pile.valid, i, j), rise, 0.0)
-        # The mirrored border repeats a straight difference at a diagonal distance: no maximum.
-        steepest = jnp.maximum(steepest, rise.max())
-    return jnp.arctan(steepest / pile.cell_size)
+def settle_dug(
+    pile: Pile,
+    dug: Float[Array, "n m"],
+    start: tuple[Array, Array],
+    *,
+    repose_angle: float = GRAVEL.repose_angle,
+    schedule: Schedule = DEFAULT_SCHEDULE,
+) -> Pile:
+    """Writes a window that was dug in back into its pile and lets the pile slide.
 
+    The window is settled alone, its sides being walls. Where that leaves the pile too steep
+    across one of them, and steeper than it was, the avalanche goes on in another window there,
+    and so on. So a pile that was within the tolerance before is so afterwards.
 
-# `relax` gives up after this many passes; a tall cliff across a 20 m grid needs about half.
-_MAX_PASSES = 60
+    Args:
+        pile: The pile before.
+        dug: Heights of the window after digging, see `window_of` [m].
+        start: First cell of the window.
+        repose_angle: Angle of repose [rad].
+        schedule: Sweeps, tolerance, and when to give up.
+
+    Returns:
+        The pile afterwards, see `settle`.
+    """
+    written = pile.replace(height=lax.dynamic_update_slice(pile.height, dug, start))
+    return _settled(written, dug.shape, jnp.stack(start), repose_angle, schedule)
 
 
 def relax(
@@ -279,60 +425,265 @@ def relax(
 ) -> Pile:
     """Lets a pile slide until no slope exceeds the angle of repose; keeps its volume.
 
-    Slopes of the floor itself, where no soil lies on it, are not changed, nor are unseen cells.
-
     Args:
         pile: Any pile.
         repose_angle: Angle of repose [rad].
         tolerance: How much steeper than `repose_angle` the result may be [rad].
 
     Returns:
-        The relaxed pile. Differentiable in `pile.height` by reverse mode.
+        The relaxed pile, see `settle`, which this is with more patience.
     """
-    limit = math.tan(repose_angle + tolerance)
-    once = Schedule(cycles=1, sweeps=DEFAULT_SCHEDULE.sweeps)
-    movable = pile.replace(valid=terrain_of(pile, repose_angle).active)
-
-    @jax.checkpoint
-    def work(height: Array) -> Array:
-        return settle_window(pile.replace(height=height), repose_angle=repose_angle, schedule=once)
-
-    def one_pass(height: Array, _: None) -> tuple[Array, None]:
-        steep = jnp.tan(steepest_slope(movable.replace(height=height))) > limit
-        return lax.cond(steep, work, lambda h: h, height), None
-
-    height, _ = lax.scan(one_pass, pile.height, None, length=_MAX_PASSES)
-    return pile.replace(height=height)
+    schedule = dataclasses.replace(DEFAULT_SCHEDULE, tolerance=tolerance, most_rounds=_MOST_ROUNDS)
+    return settle(pile, repose_angle=repose_angle, schedule=schedule)
 
 
-def terrain_of(pile: Pile, repose_angle: float) -> Terrain:
-    """The floor of a pile, and the cells that were seen and whose floor is not too steep."""
+# `relax` gives up after this many rounds; a tall cliff across a 20 m grid needs about half.
+_MOST_ROUNDS = 100
+
+
+def _settled(
+    pile: Pile,
+    window: tuple[int, ...] | None,
+    start: Array,
+    repose_angle: float,
+    schedule: Schedule,
+) -> Pile:
+    if window == pile.height.shape:
+        window = None
+    one_by_one = jax.default_backend() == "cpu"
+    solve = _solver(pile.cell_size, window, repose_angle, schedule, one_by_one)
+    return pile.replace(height=solve(pile.height, pile.ground, pile.valid, start))
+
+
+@functools.cache
+def _solver(
+    cell_size: float,
+    window: tuple[int, ...] | None,
+    repose_angle: float,
+    schedule: Schedule,
+    one_by_one: bool,
+) -> Callable[[Array, Array | None, Array | None, Array], Array]:
+    """Relaxation of (height, ground, valid, start), with its reverse rule, for one setting.
+
+    Without a window the whole grid is one. The rule keeps the surface before and nothing else, and
+    makes the rounds again: so where a rollout is rematerialised, XLA drops the forward pass, which
+    nothing asks for any more.
+    """
+    drop = cell_size * math.tan(repose_angle)
+    limit = cell_size * math.tan(repose_angle + schedule.tolerance)
+
+    def part(
+        height: Array, ground: Array | None, valid: Array | None, start: Array
+    ) -> tuple[Array, _Terrain]:
+        """The window, with sides that are multiples of the coarsest cell."""
+        pile = Pile(height, cell_size, (0.0, 0.0), ground, valid)
+        cut = pad_pile(pile if window is None else _cut(pile, start, window), schedule.block)
+        return cut.height, _Terrain(cut.ground, movable(cut, repose_angle))
+
+    def written(height: Array, part: Array, start: Array) -> Array:
+        n, m = height.shape if window is None else window
+        return lax.dynamic_update_slice(height, part[:n, :m], (start[0], start[1]))
+
+    def one_round(part: Array, terrain: _Terrain) -> Array:
+        return _round(part, terrain, drop, schedule, 0)
+
+    def make_rounds(
+        height: Array,
+        ground: Array | None,
+        valid: Array | None,
+        start: Array,
+        record: tuple[Array, Array] | None,
+    ) -> _Rounds:
+        """Rounds until the pile rests; the record takes the windows and where they were."""
+
+        def more(state: _Rounds) -> _Rounds:
+            before, terrain = part(state.height, ground, valid, state.start)
+            after = one_round(before, terrain)
+            record = state.record
+            if record is not None:
+                record = (
+                    record[0].at[state.count].set(before),
+                    record[1].at[state.count].set(state.start),
+                )
+            now = written(state.height, after, state.start)
+            steep = _steeper_than(limit, after, terrain.active)
+            if window is None:
+                return _Rounds(now, state.start, state.count + 1, steep, record)
+            start, steep = lax.cond(
+                steep,
+                lambda: (state.start, True),
+                lambda: _next_window(
+                    Pile(now, cell_size, (0.0, 0.0), ground, valid),
+                    height,
+                    state.start,
+                    window,
+                    repose_angle,
+                    limit,
+                ),
+            )
+            return _Rounds(now, start, state.count + 1, steep, record)
+
+        first, terrain = part(height, ground, valid, start)
+        steep = _steeper_than(limit, first, terrain.active)
+        return lax.while_loop(
+            lambda state: state.steep & (state.count < schedule.most_rounds),
+            more,
+            _Rounds(height, start, jnp.zeros((), jnp.int32), steep, record),
+        )
+
+    def run(height: Array, ground: Array | None, valid: Array | None, start: Array) -> Array:
+        return make_rounds(height, ground, valid, start, None).height
+
+    def pull(
+        height: Array,
+        ground: Array | None,
+        valid: Array | None,
+        start: Array,
+        cotangent: Array,
+    ) -> Array:
+        shape = part(height, ground, valid, start)[0].shape
+        record = (
+            jnp.zeros((schedule.most_rounds, *shape), height.dtype),
+            jnp.zeros((schedule.most_rounds, 2), jnp.int32),
+        )
+        made = make_rounds(height, ground, valid, start, record)
+        parts, starts = made.record
+        n, m = height.shape if window is None else window
+
+        def back(k: Array, cotangent: Array) -> Array:
+            here = starts[made.count - 1 - k]
+            _, terrain = part(height, ground, valid, here)
+            _, pullback = jax.vjp(lambda h: one_round(h, terrain), parts[made.count - 1 - k])
+            there = lax.dynamic_slice(cotangent, here, (n, m))
+            there = jnp.pad(there, ((0, -n % schedule.block), (0, -m % schedule.block)))
+            return written(cotangent, pullback(there)[0], here)
+
+        return lax.fori_loop(0, made.count, back, cotangent)
+
+    if one_by_one:
+        # A CPU gains nothing from a batch, which would make as many rounds as its slowest member.
+        run = jax.custom_batching.sequential_vmap(run)
+        pull = jax.custom_batching.sequential_vmap(pull)
+
+    @jax.custom_vjp
+    def solve(height: Array, ground: Array | None, valid: Array | None, start: Array) -> Array:
+        return run(height, ground, valid, start)
+
+    def forward(*arguments: Array | None):
+        return run(*arguments), arguments
+
+    def backward(arguments: tuple[Array | None, ...], cotangent: Array):
+        return pull(*arguments, cotangent), None, None, None
+
+    solve.defvjp(forward, backward)
+    return solve
+
+
+class _Rounds(NamedTuple):
+    """What the rounds of a relaxation carry."""
+
+    height: Array  # of the whole grid
+    start: Array  # first cell of the window
+    count: Array  # rounds made
+    steep: Array  # whether there is more to do
+    record: tuple[Array, Array] | None  # windows and their starts before each round
+
+
+def _next_window(
+    pile: Pile,
+    before: Array,
+    start: Array,
+    shape: tuple[int, ...],
+    repose_angle: float,
+    limit: float,
+) -> tuple[Array, Array]:
+    """Where an avalanche goes on beyond its window, and whether it does.
+
+    It does where the pile is too steep and steeper than it was before. If that is so across a
+    side of the window, the whole grid is searched for the steepest such place.
+    """
+
+    def worst(pile: Pile, before: Array) -> Array:
+        active = movable(pile, repose_angle)
+        rises = zip(_rises(pile.height, active), _rises(before, active), strict=True)
+        worse = (jnp.where((now > limit) & (now > then), now, 0.0) for now, then in rises)
+        return functools.reduce(jnp.maximum, worse)
+
+    beyond = []
+    for axis in (0, 1):
+        # Two cells on either side; at the border of the grid these lie inside the window.
+        sizes = tuple(4 if k == axis else n for k, n in enumerate(shape))
+        for side in (0, shape[axis]):
+            first = start.at[axis].add(side - 2)
+            strip = _cut(pile, first, sizes)
+            beyond.append(worst(strip, lax.dynamic_slice(before, first, sizes)).sum() > 0.0)
+
+    def search() -> tuple[Array, Array]:
+        steep = worst(pile, before)
+        cell = jnp.stack(jnp.unravel_index(jnp.argmax(steep), steep.shape)).astype(jnp.int32)
+        sizes = jnp.asarray(shape, jnp.int32)
+        first = jnp.clip(cell - sizes // 2, 0, jnp.asarray(steep.shape, jnp.int32) - sizes)
+        return first, steep.max() > 0.0
+
+    return lax.cond(
+        functools.reduce(jnp.logical_or, beyond), search, lambda: (start, jnp.array(False))
+    )
+
+
+def _rises(height: Array, active: Array | None) -> Iterator[Array]:
+    """Height differences to half of the neighbours over their distance in cells."""
+    around, links = _rim(height), None if active is None else _links(active)
+    for (i, j), bit in tuple(zip(_NEIGHBOURS, _BITS, strict=True))[4:]:
+        rise = jnp.abs(height - _around(around, i, j)) / math.hypot(i, j)
+        # The mirrored border repeats a straight difference at a diagonal distance: no maximum.
+        yield rise if links is None else jnp.where(links & bit != 0, rise, 0.0)
+
+
+def _steeper_than(limit: float, height: Array, active: Array | None) -> Bool[Array, ""]:
+    """Whether some height difference over its distance in cells is more than a limit [m]."""
+    steep = functools.reduce(jnp.logical_or, (r > limit for r in _rises(height, active)))
+    # XLA's sums are many times faster on a CPU than its `any` and `max`.
+    return jnp.where(steep, 1.0, 0.0).sum() > 0.0
+
+
+def steepest_slope(pile: Pile) -> Float[Array, ""]:
+    """Steepest slope between any two neighbouring cells that were seen [rad]."""
+    steepest = functools.reduce(jnp.maximum, _rises(pile.height, pile.valid)).max()
+    return jnp.arctan(steepest / pile.cell_size)
+
+
+# --- which cells, and where
+
+
+def movable(pile: Pile, repose_angle: float) -> Bool[Array, "nx ny"] | None:
+    """Cells that were seen and whose floor is not too steep for soil to lie on; None: all."""
     if pile.ground is None:
-        return Terrain(None, pile.valid)
+        return pile.valid
     drop = pile.cell_size * math.tan(repose_angle)
+    around = _rim(pile.ground)
     active = jnp.ones(pile.height.shape, bool) if pile.valid is None else pile.valid
     for i, j in _NEIGHBOURS:
-        step = jnp.abs(pile.ground - _neighbour(pile.ground, i, j))
+        step = jnp.abs(pile.ground - _around(around, i, j))
         active = active & (step <= drop * math.hypot(i, j))
-    return Terrain(pile.ground, active)
+    return active
 
 
-def pad_pile(pile: Pile, shape: tuple[int, int]) -> Pile:
-    """Extends a pile to `shape` with cells that take no part; unchanged if it has that shape."""
+def pad_pile(pile: Pile, block: int) -> Pile:
+    """Extends the sides of a pile to multiples of `block` cells; the new ones take no part."""
     nx, ny = pile.height.shape
-    if (nx, ny) == shape:
+    widths = ((0, -nx % block), (0, -ny % block))
+    if widths == ((0, 0), (0, 0)):
         return pile
-    widths = ((0, shape[0] - nx), (0, shape[1] - ny))
     valid = jnp.ones((nx, ny), bool) if pile.valid is None else pile.valid
     return pile.replace(
-        height=jnp.pad(pile.height, widths),
-        ground=None if pile.ground is None else jnp.pad(pile.ground, widths),
+        height=jnp.pad(pile.height, widths, mode="edge"),
+        ground=None if pile.ground is None else jnp.pad(pile.ground, widths, mode="edge"),
         valid=jnp.pad(valid, widths),
     )
 
 
-# Side of the window that a loading disturbs [cells], and how far its centre lies ahead of the
-# dig location along the heading [m]: the bucket reaches 3.2 m in, avalanches run up from there.
+# Side of the window that is settled after a loading [cells], and how far its centre lies ahead of
+# the dig location along the heading [m]: the bucket reaches 4.5 m in, avalanches run up from there.
 WINDOW = 96
 _WINDOW_AHEAD = 2.0
 
@@ -352,30 +703,16 @@ def window_of(pile: Pile, pose: Pose) -> tuple[Pile, tuple[Array, Array]]:
         for position, size, n in zip(centre, sizes, pile.height.shape, strict=True)
     )
 
+    window = _cut(pile, start, sizes)
+    corner = jnp.stack([s.astype(pile.height.dtype) for s in start])
+    origin = jnp.asarray(pile.origin) + pile.cell_size * corner
+    return window.replace(origin=origin), (start[0], start[1])
+
+
+def _cut(pile: Pile, start: Array | tuple[Array, ...], sizes: tuple[int, ...]) -> Pile:
+    """The fields of a part of the grid."""
+
     def cut(field: Array | None) -> Array | None:
         return None if field is None else lax.dynamic_slice(field, start, sizes)
 
-    corner = jnp.stack([s.astype(pile.height.dtype) for s in start])
-    window = pile.replace(
-        height=cut(pile.height),
-        ground=cut(pile.ground),
-        valid=cut(pile.valid),
-        origin=jnp.asarray(pile.origin) + pile.cell_size * corner,
-    )
-    return window, (start[0], start[1])
-
-
-def settle_window(
-    window: Pile, *, repose_angle: float, schedule: Schedule = DEFAULT_SCHEDULE
-) -> Float[Array, "nx ny"]:
-    """The heights of a disturbed pile or window after `settle`, whatever its size [m]."""
-    nx, ny = window.height.shape
-    padded = pad_pile(window, (nx + -nx % schedule.block, ny + -ny % schedule.block))
-    height = settle(
-        padded.height,
-        cell_size=window.cell_size,
-        repose_angle=repose_angle,
-        terrain=terrain_of(padded, repose_angle),
-        schedule=schedule,
-    )
-    return height[:nx, :ny]
+    return pile.replace(height=cut(pile.height), ground=cut(pile.ground), valid=cut(pile.valid))

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import no_type_check
 
 from flax import struct
-from jax import lax
 
-from wlplan.automaton import DEFAULT_SCHEDULE, Schedule, settle_window, window_of
+from wlplan.automaton import DEFAULT_SCHEDULE, Schedule, settle_dug, window_of
 from wlplan.characteristics import as_vector, characteristics
 from wlplan.errors import InputError
 from wlplan.excavation import excavate
@@ -46,8 +45,9 @@ class LowWorld(struct.PyTreeNode):
         dug, volume = excavate(
             window, pose, predicted.mass / per_volume, width=self.machine.bucket_width
         )
-        settled = settle_window(dug, repose_angle=self.soil.repose_angle, schedule=self.schedule)
-        after = pile.replace(height=lax.dynamic_update_slice(pile.height, settled, start))
+        after = settle_dug(
+            pile, dug.height, start, repose_angle=self.soil.repose_angle, schedule=self.schedule
+        )
         return after, predicted.replace(mass=volume * per_volume)
 
 

@@ -6,9 +6,8 @@ from typing import no_type_check
 
 import jax.numpy as jnp
 from flax import struct
-from jax import lax
 
-from wlplan.automaton import DEFAULT_SCHEDULE, Schedule, settle_window, window_of
+from wlplan.automaton import DEFAULT_SCHEDULE, Schedule, settle_dug, window_of
 from wlplan.heightmap import (
     STATE_CELLS,
     STATE_DISPLACEMENT,
@@ -72,10 +71,13 @@ class Simulator(struct.PyTreeNode):
         # What left the grid is the load: float rounding of the time stepping goes to the mass.
         change = cycle.height - height
         dug = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
-        settled = settle_window(
-            window.replace(height=dug), repose_angle=self.soil.repose_angle, schedule=self.schedule
+        after = settle_dug(
+            pile,
+            dug,
+            start,
+            repose_angle=self.soil.repose_angle,
+            schedule=self.schedule,
         )
-        after = pile.replace(height=lax.dynamic_update_slice(pile.height, settled, start))
         work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
         performance = Performance(
             mass=cycle.mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ
