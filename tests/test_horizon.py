@@ -10,7 +10,6 @@ from laws import assert_gradient
 
 import wlplan
 from wlplan.automaton import relax
-from wlplan.compilation import jit_small_loops
 from wlplan.horizon import closed_loop, rollout
 from wlplan.machine import GRAVEL
 from wlplan.objective import OBJECTIVES, loading_cost
@@ -247,7 +246,7 @@ def test_the_gradient_check_can_fail():
 def gradient_of_one(low):
     """Gradient of the cost of two loadings with respect to plan and heights."""
 
-    @jit_small_loops
+    @jax.jit
     def run(height, origin, plan):
         def cost(plan, height):
             return cost_in(low, Pile(height, 0.1, origin))(plan)

@@ -1,45 +1,64 @@
-"""Compiling large differentiated programs quickly on the CPU.
+"""Running several rollouts side by side.
 
-Programs like the gradient of a rollout are many small loops over small grids. Without fusion
-emitters and at the first optimisation level XLA compiled them faster on the CPU, and what it made
-ran faster too.
-For the simulator's batches the opposite holds, so this is chosen function by function.
+A CPU gains nothing from a batch of rollouts, which only takes longer to compile and waits for its
+slowest member; but each of its cores can run one.
 """
 
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
-_OPTIONS = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+
+class EachRow:
+    """`function(shared, row)` for several rows: pytrees whose leaves have one more leading axis.
+
+    On a CPU the rows are shared out among its cores, elsewhere they are one `vmap`.
+
+    Args:
+        function: Pure function of what the rows share and of one row.
+    """
+
+    def __init__(self, function: Callable[[Any, Any], Any]):
+        self._one = jax.jit(function)
+        self._batch = jax.jit(jax.vmap(function, in_axes=(None, 0)))
+        self._ran: set[Any] = set()
+
+    def __call__(self, shared: Any, rows: Any) -> Any:
+        """The results, leaves with the leading axis of the rows."""
+        if jax.default_backend() != "cpu":
+            return self._batch(shared, rows)
+        count = len(jax.tree.leaves(rows)[0])
+        members = [jax.tree.map(lambda leaf, k=k: leaf[k], rows) for k in range(count)]
+        results = []
+        kind = _kind(shared, members[0])
+        if kind not in self._ran:
+            # Alone, so that it is compiled once.
+            results.append(jax.block_until_ready(self._one(shared, members.pop(0))))
+            self._ran.add(kind)
+        # The precision is a setting of the thread.
+        double = jnp.zeros(()).dtype == np.float64
+
+        def run(member: Any) -> Any:
+            with jax.enable_x64(double):
+                return jax.block_until_ready(self._one(shared, member))
+
+        results += _cores().map(run, members)
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
 
 
 @functools.cache
-def _options() -> dict[str, Any]:
-    """The options, where this backend and this version of XLA know them."""
-    if jax.default_backend() != "cpu":
-        return {}
-    try:
-        jax.jit(lambda x: x + 1.0, compiler_options=_OPTIONS)(0.0)
-    except jax.errors.JaxRuntimeError:
-        return {}
-    return _OPTIONS
+def _cores() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count())
 
 
-def jit_small_loops(
-    function: Callable[..., Any], *, static_argnames: tuple[str, ...] = ()
-) -> Callable[..., Any]:
-    """`jax.jit` for programs of many small loops; the backend is asked at the first call."""
-
-    @functools.cache
-    def compiled() -> Callable[..., Any]:
-        return jax.jit(function, static_argnames=static_argnames, compiler_options=_options())
-
-    @functools.wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        return compiled()(*args, **kwargs)
-
-    return call
+def _kind(*arguments: Any) -> Any:
+    leaves, tree = jax.tree.flatten(arguments)
+    return tree, tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)

@@ -12,7 +12,7 @@ from wlplan.errors import InputError
 from wlplan.objective import Objective, objective_named
 from wlplan.pile import ToeContour, toe_contour
 from wlplan.planner.gradient import GradientSettings, gradient
-from wlplan.planner.job import Decisions, Job, Outcome, ToeJob, outcomes, played, played_in_model
+from wlplan.planner.job import Decisions, Job, Outcome, ToeJob, outcomes, played
 from wlplan.planner.search import Progress, SearchSettings, greedy, nominal
 from wlplan.planner.toe import toe_of
 from wlplan.simulator import Simulator
@@ -110,7 +110,7 @@ def plan_loads(
         return _member(seen, int(np.nanargmin(np.asarray(seen.cost))))
     # The toe is where the referee's pile begins, so the poses are the ones it was played with.
     judged = outcomes(job.replace(world=_as_pytree(referee)), candidates)
-    seen = played_in_model(Job(job.world, pile, job.receiver, job.objective), judged.plan)
+    seen = played(Job(job.world, pile, job.receiver, job.objective), judged.plan)
     costs = np.asarray(seen.cost)
     # Rounding may put a plan that is its own limit above it.
     allowed = costs <= costs[-1] * (1.0 + 1e-6)

@@ -23,7 +23,7 @@ class GradientSettings:
 
     # Plans that are optimised side by side: greedy, nominal, and perturbations of the first.
     starts: int = 6
-    iterations: int = 40
+    iterations: int = 32
     # Largest step of an iteration: along the contour [m], heading offset and action before
     # squashing.
     step_position: float = 0.12

@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from wlplan.compilation import jit_small_loops
+from wlplan.compilation import EachRow
 from wlplan.horizon import closed_loop
 from wlplan.objective import Objective, loading_cost
 from wlplan.planner.toe import Toe, pose_at
@@ -130,29 +130,16 @@ def stacked(decisions: Sequence[Decisions]) -> Decisions:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *decisions)
 
 
-@jax.jit
-def outcomes(job: ToeJob, plans: Decisions) -> Outcome:
-    """Plays several plans; leaves [K, N]."""
-    return jax.vmap(lambda decisions: play_decisions(job, decisions))(plans)
+outcomes = EachRow(play_decisions)
+"""`outcomes(job, plans)` plays several plans; leaves [K, N]."""
+
+played = EachRow(play_plan)
+"""`played(job, plans)` plays several fixed plans; leaves [K, N]."""
 
 
-def _played(job: Job, plans: LoadingPlan) -> Outcome:
-    return jax.vmap(lambda plan: play_plan(job, plan))(plans)
+def _cost_and_gradient(job: ToeJob, plan: Decisions) -> tuple[Float[Array, ""], Decisions]:
+    return jax.value_and_grad(lambda decisions: play_decisions(job, decisions).cost)(plan)
 
 
-played = jax.jit(_played)
-"""Plays several fixed plans; leaves [K, N]."""
-
-played_in_model = jit_small_loops(_played)
-"""The same, compiled for a world that is a model."""
-
-
-def _costs_and_gradients(job: ToeJob, plans: Decisions) -> tuple[Float[Array, " k"], Decisions]:
-    def cost(decisions: Decisions) -> Array:
-        return play_decisions(job, decisions).cost
-
-    return jax.vmap(jax.value_and_grad(cost))(plans)
-
-
-costs_and_gradients = jit_small_loops(_costs_and_gradients)
-"""Cost of several plans, leaves [K, N], and its gradient."""
+costs_and_gradients = EachRow(_cost_and_gradient)
+"""`costs_and_gradients(job, plans)`: cost of several plans, leaves [K, N], and its gradient."""

@@ -16,7 +16,6 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from wlplan.compilation import jit_small_loops
 from wlplan.planner.job import (
     Decisions,
     ToeJob,
@@ -71,7 +70,8 @@ def _candidate_costs(
     return jax.lax.map(at_pose, poses, batch_size=max(1, batch // actions.shape[0]))
 
 
-def _refine_starts(
+@functools.partial(jax.jit, static_argnames=("steps", "rate"))
+def _refine(
     job: ToeJob, pile: Pile, starts: Decisions, *, steps: int, rate: float
 ) -> tuple[Decisions, Float[Array, " k"]]:
     """Adam on single loadings, from several starts; returns the best visited of each."""
@@ -100,10 +100,7 @@ def _refine_starts(
     return jax.vmap(one)(starts)
 
 
-_refine = jit_small_loops(_refine_starts, static_argnames=("steps", "rate"))
-
-
-@jit_small_loops
+@jax.jit
 def _advance(job: ToeJob, pile: Pile, decisions: Decisions) -> Pile:
     return job.world(pile, *decide(job, pile, decisions))[0]
 
