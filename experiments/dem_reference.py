@@ -17,7 +17,7 @@ from experiments.record import main
 from wlplan.io import write_bytes_atomic
 from wlplan.machine import GRAVEL, WA320
 from wlplan.plots import png_bytes
-from wlplan.simulator import STOP_REASONS, dig
+from wlplan.simulator import STOP_REASONS, Cycle, dig
 from wlplan.types import action_from
 
 REFERENCE = Path(__file__).parents[1] / "tests" / "references" / "dem_cycles.npz"
@@ -40,9 +40,8 @@ MACHINE = dataclasses.replace(
 )
 
 
-def run(preset: str) -> dict[str, Any]:
-    """Plays the reference's actions on the reference's surfaces with its machine constants."""
-    count = 4 if preset == "smoke" else None
+def replay(count: int | None = None) -> tuple[dict[str, np.ndarray], Cycle]:
+    """The reference's first cycles, and ours on its surfaces, with its actions and machine."""
     with np.load(REFERENCE) as stored:
         reference = {name: stored[name][:count] for name in stored if stored[name].ndim}
     # The reference's cells lie half a cell further along the heading than ours.
@@ -56,6 +55,12 @@ def run(preset: str) -> dict[str, Any]:
             lambda h, a: dig(h, jnp.zeros_like(h), action_from(a), machine=MACHINE, soil=GRAVEL)
         )
     )(surface, actions)
+    return reference, cycle
+
+
+def run(preset: str) -> dict[str, Any]:
+    """Plays the reference's actions on the reference's surfaces with its machine constants."""
+    reference, cycle = replay(4 if preset == "smoke" else None)
     ours = {
         "mass": cycle.mass / 1e3,
         "time": cycle.time,
@@ -64,7 +69,7 @@ def run(preset: str) -> dict[str, Any]:
     }
     theirs = {name: reference[f"{name}_{unit}"] for name, unit in _UNITS.items()}
     return {
-        "cycles": len(actions),
+        "cycles": len(cycle.mass),
         "agreement": {name: _agreement(np.asarray(ours[name]), theirs[name]) for name in ours},
         "ours": {name: np.asarray(value).tolist() for name, value in ours.items()},
         "reference": {name: value.tolist() for name, value in theirs.items()},

@@ -1,8 +1,6 @@
 """The simulator: ledgers, symmetries and trends of a loading; then values; then gradients."""
 
-import dataclasses
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage, stats
 
+from experiments.dem_reference import REFERENCE, replay
 from wlplan.automaton import relax, steepest_slope
 from wlplan.heightmap import local_axes
 from wlplan.machine import GRAVEL, WA320
@@ -128,7 +127,8 @@ def test_nothing_is_dug_below_the_ground(loadings):
     assert (np.asarray(after.height) - np.asarray(piles.ground)).min() >= -1e-5
 
 
-def test_the_pile_far_from_the_bucket_is_left_alone(loadings):
+def test_far_from_the_bucket_a_little_soil_slides_at_most(loadings):
+    """Beyond the window of the automaton only an avalanche that leaves it can move soil."""
     _, (piles, pose, _), (after, _, _), (seeds, _, _) = loadings
     axis = 0.1 * np.arange(GRID)
     x, y = (np.asarray(piles.origin)[seeds, k, None] + axis for k in (0, 1))
@@ -140,15 +140,14 @@ def test_the_pile_far_from_the_bucket_is_left_alone(loadings):
         > 9.0
     )
     moved = np.abs(np.asarray(after.height) - np.asarray(piles.height))[seeds]
-    assert (moved * far).max() == 0.0
+    assert (moved * far).max() < 0.05
+    assert (moved * far).sum() < 0.02 * moved.sum()
 
 
-def test_the_pile_after_is_close_to_the_angle_of_repose(loadings):
-    """Within what the default schedule of the automaton promises, and a little."""
+def test_the_pile_after_is_within_a_degree_of_the_angle_of_repose(loadings):
     _, _, (after, _, _), (seeds, _, _) = loadings
     steepest = jax.vmap(lambda h: steepest_slope(Pile(h, 0.1)))(after.height[seeds])
-    assert np.degrees(np.median(steepest)) < 34.0
-    assert np.degrees(np.max(steepest)) < 40.0
+    assert np.degrees(np.max(steepest)) <= 33.0 + 1e-3
 
 
 def test_where_there_is_nothing_the_bucket_stays_empty(loadings):
@@ -389,39 +388,15 @@ def test_a_drive_into_nothing_has_a_closed_form(digs):
 
 # --- Against the discrete elements: a guard against regressions, not a validation. --------------
 
-# The machine of the discrete-element cycles; see the provenance in the file.
-DEM_MACHINE = dataclasses.replace(
-    WA320,
-    mass=15_500.0,
-    boom_length=2.6,
-    pivot_height=1.9,
-    boom_low=math.asin((0.35 - 1.9) / 2.6),
-    tip_radius=math.hypot(1.32, 0.35),
-    tilt_end=math.radians(50.0),
-    boom_speed=0.23,
-    tilt_speed=0.55,
-    tilt_moment=220e3,
-    traction=0.75,
-    wheel_power=110e3,
-    speed_gain=2e5,
-    bucket_heaped=3.05,
-)
-
 
 @pytest.fixture(scope="module")
 def against_dem():
-    with np.load(Path(__file__).parent / "references" / "dem_cycles.npz") as file:
+    return replay()
+
+
+def test_the_stored_reference_says_where_it_comes_from():
+    with np.load(REFERENCE) as file:
         reference = dict(file)
-    # Their cells lie half a cell off ours.
-    height = reference["h0_cg"].astype(np.float32)
-    height = ndimage.shift(height, (0, 0.5, 0), order=1, mode="nearest")
-    count = len(height)
-    cycle = batched(machine=DEM_MACHINE, batch=count)(height, reference["action"])
-    return reference, cycle
-
-
-def test_the_stored_reference_says_where_it_comes_from(against_dem):
-    reference, _ = against_dem
     assert "LAMMPS" in str(reference["provenance"])
     assert reference["h0_cg"].shape == (len(reference["mass_t"]), 52, 52)
 
