@@ -30,7 +30,7 @@ import functools
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -119,7 +119,7 @@ def sweep(
         giving: Part of its outflow that each cell lets go; None: all.
     """
     around = _rim(height)
-    giving_around = None if giving is None else _rim(giving)
+    giving_around = _rim(jnp.ones_like(height) if giving is None else giving)
     links = None if active is None else _links(active)
     outflow = jnp.zeros_like(height)
     for (i, j), bit in zip(_NEIGHBOURS, _BITS, strict=True):
@@ -480,23 +480,25 @@ def _solver(
             record = state.record
             if record is not None:
                 record = (
-                    record[0].at[state.count].set(before),
-                    record[1].at[state.count].set(state.start),
+                    record[0].at[state.made].set(before),
+                    record[1].at[state.made].set(state.start),
                 )
             height = _paste(state.height, after[: shape[0], : shape[1]], state.start)
             steep = _steeper_than(limit, after, terrain.active)
-            made = state._replace(height=height, count=state.count + 1, steep=steep, record=record)
-            if shape == pile.height.shape:
-                return made
-            return lax.cond(
-                steep, lambda: made, lambda: _go_beyond(pile, made, shape, repose_angle, limit)
-            )
+            start, left = state.start, state.left
+            if shape != pile.height.shape:
+                start, steep, left = lax.cond(
+                    steep,
+                    lambda: (start, jnp.array(True), left),
+                    lambda: _go_beyond(pile, height, start, left, shape, repose_angle, limit),
+                )
+            return _Rounds(height, start, state.made + 1, steep, left, record)
 
         height = _paste(pile.height, dug, start)
         first, terrain = cut(pile.replace(height=height), start, shape)
         steep = _steeper_than(limit, first, terrain.active)
         return lax.while_loop(
-            lambda state: state.steep & (state.count < schedule.most_rounds),
+            lambda state: state.steep & (state.made < schedule.most_rounds),
             more,
             _Rounds(height, start, jnp.zeros((), jnp.int32), steep, jnp.array(False), record),
         )
@@ -522,18 +524,19 @@ def _solver(
             jnp.zeros((schedule.most_rounds, *padded), before.dtype),
             jnp.zeros((schedule.most_rounds, 2), jnp.int32),
         )
-        made = make_rounds(pile, dug, start, record)
-        parts, starts = made.record
+        last = make_rounds(pile, dug, start, record)
+        assert last.record is not None
+        parts, starts = last.record
 
         def back(k: Array, cotangent: Array) -> Array:
-            here = starts[made.count - 1 - k]
+            here = starts[last.made - 1 - k]
             _, terrain = cut(pile, here, shape)
-            _, pullback = jax.vjp(lambda h: one_round(h, terrain), parts[made.count - 1 - k])
+            _, pullback = jax.vjp(lambda h: one_round(h, terrain), parts[last.made - 1 - k])
             part = lax.dynamic_slice(cotangent, here, shape)
             part = jnp.pad(part, [(0, p - n) for p, n in zip(padded, shape, strict=True)])
             return _paste(cotangent, pullback(part)[0][: shape[0], : shape[1]], here)
 
-        cotangent = lax.fori_loop(0, made.count, back, cotangent)
+        cotangent = lax.fori_loop(0, last.made, back, cotangent)
         of_dug = lax.dynamic_slice(cotangent, start, shape)
         return _paste(cotangent, jnp.zeros_like(of_dug), start), of_dug
 
@@ -548,11 +551,11 @@ def _solver(
     ) -> Array:
         return run(before, dug, ground, valid, start)
 
-    def forward(*arguments: Array | None):
+    def forward(*arguments: Any):
         return run(*arguments), arguments
 
-    def backward(arguments: tuple[Array | None, ...], cotangent: Array):
-        return *pull(*arguments, cotangent), None, None, None
+    def backward(arguments: tuple[Any, ...], cotangent: Array):
+        return *pull(*(*arguments, cotangent)), None, None, None
 
     solve.defvjp(forward, backward)
     return solve
@@ -567,20 +570,26 @@ class _Rounds(NamedTuple):
 
     height: Array  # of the whole grid
     start: Array  # first cell of the window
-    count: Array  # rounds made
+    made: Array  # rounds so far
     steep: Array  # whether there is more to do
     left: Array  # whether the avalanche has left its first window
     record: tuple[Array, Array] | None  # windows and their starts before each round
 
 
 def _go_beyond(
-    pile: Pile, made: _Rounds, shape: tuple[int, ...], repose_angle: float, limit: float
-) -> _Rounds:
-    """The next window of an avalanche, if it goes on beyond the one that has come to rest.
+    pile: Pile,
+    height: Array,
+    start: Array,
+    left: Array,
+    shape: tuple[int, ...],
+    repose_angle: float,
+    limit: float,
+) -> tuple[Array, Array, Array]:
+    """The next window of an avalanche, whether there is one, and whether it has left the first.
 
-    It does where the pile is too steep and steeper than it was before the loading. If that is so
-    across a side of the first window, the whole grid is searched for the steepest such place, and
-    again after every further window.
+    It goes on where the pile is too steep and steeper than it was before the loading. If that is
+    so across a side of the first window, the whole grid is searched for the steepest such place,
+    and again after every further window.
     """
 
     def worst(before: Pile, height: Array) -> Array:
@@ -589,25 +598,25 @@ def _go_beyond(
         worse = (jnp.where((now > limit) & (now > then), now, 0.0) for now, then in rises)
         return functools.reduce(jnp.maximum, worse)
 
-    beyond = [made.left]
+    beyond = [left]
     for axis in (0, 1):
         # Two cells on either side; at the border of the grid these lie inside the window.
         sizes = tuple(4 if k == axis else n for k, n in enumerate(shape))
         for side in (0, shape[axis]):
-            first = made.start.at[axis].add(side - 2)
-            strip = lax.dynamic_slice(made.height, first, sizes)
+            first = start.at[axis].add(side - 2)
+            strip = lax.dynamic_slice(height, first, sizes)
             beyond.append(worst(_cut(pile, first, sizes), strip).sum() > 0.0)
     left = functools.reduce(jnp.logical_or, beyond)
 
     def search() -> tuple[Array, Array]:
-        steep = worst(pile, made.height)
+        steep = worst(pile, height)
         cell = jnp.stack(jnp.unravel_index(jnp.argmax(steep), steep.shape)).astype(jnp.int32)
         sizes = jnp.asarray(shape, jnp.int32)
         first = jnp.clip(cell - sizes // 2, 0, jnp.asarray(steep.shape, jnp.int32) - sizes)
         return first, steep.max() > 0.0
 
-    start, steep = lax.cond(left, search, lambda: (made.start, jnp.array(False)))
-    return made._replace(start=start, steep=steep, left=left)
+    start, steep = lax.cond(left, search, lambda: (start, jnp.array(False)))
+    return start, steep, left
 
 
 def _rises(height: Array, active: Array | None) -> Iterator[Array]:
