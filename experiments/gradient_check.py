@@ -7,82 +7,25 @@ import math
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
 import wlplan
 from experiments.record import main
+from wlplan.gradcheck import COMPONENTS, TOLERANCE, check_gradient, random_plan
 from wlplan.io import write_bytes_atomic
 from wlplan.objective import OBJECTIVES
-from wlplan.planner.job import Job, play_plan
+from wlplan.planner.job import Job
 from wlplan.plots import png_bytes
 from wlplan.transport import default_receiver
 
-KIND, SLOPE_DEGREES, SEED, LOADS, STEP = "conical", 30.0, 1, 5, 1e-6
-COMPONENTS = ("x", "y", "heading", "delta_bm", "k_bm", "delta_bk", "k_bk")
+KIND, SLOPE_DEGREES, SEED, LOADS = "conical", 30.0, 1, 5
 
 
 def run(preset: str) -> dict[str, Any]:
     """Reverse mode and central differences over every pose and action component."""
     loads = 1 if preset == "smoke" else LOADS
     pile = wlplan.relax(wlplan.seed_pile(KIND, slope=math.radians(SLOPE_DEGREES), seed=SEED))
-    contour = wlplan.toe_contour(pile)
-    rng = np.random.default_rng(SEED)
-    # Neighbouring digs, so that each feels what the ones before did.
-    index = (np.arange(loads) * 11) % len(contour.points)
-    pose = np.c_[contour.points[index], contour.heading[index] + 0.1 * rng.normal(size=loads)]
-    action = np.array([0.35, 2.5, 0.35, 2.5]) * rng.uniform(0.6, 1.4, (loads, 4))
-    with jax.enable_x64(True):
-        wide = jax.tree.map(_widened, (wlplan.load_world("low"), pile, default_receiver(pile)))
-        world, pile, receiver = wide
-        job = Job(world, pile, receiver, OBJECTIVES["efficiency"])
-
-        def cost(flat: jax.Array) -> jax.Array:
-            table = flat.reshape(loads, 7)
-            plan = wlplan.LoadingPlan(wlplan.Pose(*table[:, :3].T), wlplan.Action(*table[:, 3:].T))
-            return play_plan(job, plan).cost
-
-        flat = np.c_[pose, action].ravel()
-        exact = np.asarray(jax.jit(jax.grad(cost))(flat))
-        value = jax.jit(cost)
-        here = float(value(flat))
-        rows = []
-        for k in range(flat.size):
-            ahead, behind = flat.copy(), flat.copy()
-            ahead[k] += STEP
-            behind[k] -= STEP
-            up, down = float(value(ahead)), float(value(behind))
-            central = (up - down) / (2 * STEP)
-            scale = max(abs(central), abs(exact[k]), 1e-3 * np.abs(exact).max())
-            error = abs(central - exact[k]) / scale
-            bend = abs(up - 2 * here + down) / STEP / scale
-            rows.append(
-                {
-                    "load": k // 7 + 1,
-                    "component": COMPONENTS[k % 7],
-                    "reverse": float(exact[k]),
-                    "central": central,
-                    "relative_error": error,
-                    # One-sided differences that disagree by half the error: a kink within STEP.
-                    "kink": bool(error > 1e-4 and bend > 0.5 * error),
-                }
-            )
-    smooth = [row["relative_error"] for row in rows if not row["kink"]]
-    return {
-        "loads": loads,
-        "step": STEP,
-        "components": len(rows),
-        "kinks": sum(row["kink"] for row in rows),
-        "largest_relative_error": max(smooth),
-        "median_relative_error": float(np.median(smooth)),
-        "rows": rows,
-    }
-
-
-def _widened(leaf: Any) -> Any:
-    array = np.asarray(leaf)
-    return jnp.asarray(array, jnp.float64) if array.dtype.kind == "f" else leaf
+    job = Job(wlplan.load_world("low"), pile, default_receiver(pile), OBJECTIVES["efficiency"])
+    check = check_gradient(job, random_plan(pile, loads, seed=SEED))
+    return {"loads": loads, **check.as_dict()}
 
 
 def draw(folder: Path) -> None:
@@ -93,10 +36,11 @@ def draw(folder: Path) -> None:
     figure = Figure(figsize=(5.6, 3.4), layout="constrained")
     axis = figure.subplots()
     for name in COMPONENTS:
-        rows = [row for row in result["rows"] if row["component"] == name and not row["kink"]]
+        rows = [row for row in result["rows"] if row["component"] == name]
+        rows = [row for row in rows if row["verdict"] != "kink"]
         errors = [max(row["relative_error"], 1e-14) for row in rows]
         axis.semilogy([row["load"] for row in rows], errors, "o", ms=4, label=name)
-    axis.axhline(1e-4, color="#999999", lw=1)
+    axis.axhline(TOLERANCE, color="#999999", lw=1)
     axis.set_xticks(range(1, result["loads"] + 1))
     axis.set_xlabel("load")
     axis.set_ylabel("relative error of the gradient")

@@ -36,11 +36,10 @@ def heap(seed=0):
 
 
 def plan_of(rows, dtype=jnp.float32):
-    """A plan from an array [N, 7]: x, y, heading, action."""
+    """Plans from an array [..., N, 7]: x, y, heading, action."""
     rows = jnp.asarray(rows, dtype)
-    return LoadingPlan(
-        pose=Pose(rows[:, 0], rows[:, 1], rows[:, 2]), action=action_from(rows[:, 3:])
-    )
+    pose = Pose(rows[..., 0], rows[..., 1], rows[..., 2])
+    return LoadingPlan(pose=pose, action=action_from(rows[..., 3:]))
 
 
 def random_rows(seed, loads):
@@ -275,3 +274,111 @@ def test_gradients_are_finite_everywhere(case, cone, gradient_of_one):
         assert np.isfinite(leaf).all()
     if case == "on the pile":
         assert min(np.abs(leaf).max() for leaf in jax.tree.leaves(gradient)) > 0.0
+
+
+# --- Wherever a bucket may be sent. -------------------------------------------------------------
+
+CELLS, CELL = 48, 0.2  # a small grid, from -4.8 m to 4.6 m
+SIDE = CELL * (np.arange(CELLS) - CELLS // 2)
+
+
+def small_piles():
+    """Heights [4, 48, 48]: a cone, level ground, a layer of 5 cm, and a ridge to the border."""
+    x, y = np.meshgrid(SIDE, SIDE, indexing="ij")
+    bumps = 0.1 * np.random.default_rng(0).normal(size=x.shape)
+    cone = np.maximum(1.8 - 0.55 * np.hypot(x, y) + bumps, 0.0)
+    ridge = np.maximum(1.5 - 0.5 * np.abs(x), 0.0)
+    piles = [cone, np.zeros_like(x), np.where(np.hypot(x, y) < 3.0, 0.05, 0.0), ridge]
+    return np.stack(piles).astype(np.float32)
+
+
+def wild_rows(seed, plans, loads=2):
+    """Plans [plans, loads, 7] of digs on the pile, off it, on lines of the grid and far outside.
+
+    Half of the plans dig the same place again and again, which exhausts it. Actions reach the
+    corners of their box.
+    """
+    rng = np.random.default_rng(seed)
+    shape = (plans, loads)
+    near, far = rng.uniform(-5.0, 5.0, (*shape, 2)), rng.uniform(-60.0, 60.0, (*shape, 2))
+    line = rng.choice(SIDE, (*shape, 2))
+    border = np.where(rng.random((*shape, 2)) < 0.5, line, rng.choice(SIDE[[0, -1]], (*shape, 2)))
+    away = rng.uniform(-math.pi, math.pi, shape)
+    toe = -3.0 * np.stack([np.cos(away), np.sin(away)], axis=-1)
+    kind = rng.integers(5, size=shape)[..., None]
+    place = np.select([kind == k for k in range(5)], [toe, near, line, border, far])
+    heading = np.where(rng.random(shape) < 0.7, away, 0.25 * math.pi * rng.integers(-4, 5, shape))
+    action = rng.uniform(size=(*shape, 4))
+    action = np.where(rng.random(action.shape) < 0.1, np.round(action), action)
+    rows = np.concatenate([place, heading[..., None], action * [0.7, 5.0, 0.7, 5.0]], axis=-1)
+    rows[::2] = rows[::2, :1]
+    return rows
+
+
+def with_floor(height):
+    """A sloping floor under a pile, and a corner that was not seen."""
+    i, j = np.indices((CELLS, CELLS))
+    ground = (0.02 * CELL * i).astype(np.float32)
+    return {"ground": jnp.asarray(ground), "valid": jnp.asarray(i + j > 12)}, height + ground
+
+
+@pytest.mark.parametrize(
+    ("plans", "floor"),
+    [
+        (200, False),
+        pytest.param(8_000, False, marks=pytest.mark.slow),
+        pytest.param(2_000, True, marks=pytest.mark.slow),
+    ],
+)
+def test_gradients_are_finite_for_any_plan(low, plans, floor):
+    piles = jnp.asarray(small_piles())
+    fields = {}
+    if floor:
+        fields, piles = with_floor(piles)
+
+    def check(case):
+        """Whether the cost and its gradient in plan and heights are finite, and its largest."""
+        plan, which = case
+
+        def cost(plan, height):
+            return cost_in(low, Pile(height, CELL, jnp.asarray(SIDE[[0, 0]]), **fields))(plan)
+
+        results = jax.value_and_grad(cost, argnums=(0, 1))(plan, piles[which])
+        leaves = jax.tree.leaves(results)
+        finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]).all()
+        return finite, jnp.stack([jnp.abs(leaf).max() for leaf in leaves]).max()
+
+    # One after the other: on a CPU a batch would only make the slowest member's work for all.
+    run = jax.jit(lambda *cases: jax.lax.map(check, cases))
+    rows = wild_rows(1, plans)
+    # Every pile with both kinds of plan.
+    which = np.arange(plans) // 2 % len(piles)
+    finite, largest = (np.asarray(v) for v in run(plan_of(rows), jnp.asarray(which)))
+    worst = np.flatnonzero(~finite)
+    assert finite.all(), f"{worst.size} of {plans}: pile {which[worst[0]]}, {rows[worst[0]]}"
+    assert largest.max() < 1e4
+    assert np.median(largest) > 0.0
+
+
+@pytest.mark.parametrize("reverse", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_vmap_over_plans_and_piles_equals_the_members(low, reverse):
+    """In the shipped world, where each member makes its own number of rounds."""
+    with jax.enable_x64(True):
+        world, piles = in_float64((low, jnp.asarray(small_piles()[[0, 3]])))
+        plans = plan_of(wild_rows(2, 3), jnp.float64)
+
+        def play(height, plan):
+            pile = Pile(height, CELL, jnp.asarray(SIDE[[0, 0]]))
+            return jax.grad(cost_in(world, pile))(plan) if reverse else rollout(world, pile, plan)
+
+        one = jax.jit(play)
+        every = jax.jit(jax.vmap(jax.vmap(play, in_axes=(None, 0)), in_axes=(0, None)))
+        batch = every(piles, plans)
+        for i in range(2):
+            for k in range(3):
+                member = one(piles[i], jax.tree.map(lambda leaf, k=k: leaf[k], plans))
+                jax.tree.map(
+                    lambda a, b, i=i, k=k: np.testing.assert_allclose(b[i, k], a, 1e-8, 1e-10),
+                    member,
+                    batch,
+                )

@@ -22,7 +22,8 @@ LAYERS = [
     *("worlds", "horizon"),
     *("transport", "objective"),
     *("planner.toe", "planner.job", "planner.search", "planner.gradient", "planner"),
-    *("diggability", "io", "plots", "report"),
+    *("diggability", "gradcheck", "io", "plots", "report"),
+    *("bench.timing", "bench.digs", "bench.baselines", "bench.items", "bench"),
     *("cli", "__main__"),
 ]
 

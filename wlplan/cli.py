@@ -1,4 +1,4 @@
-"""The command line: `wlplan plan`, `simulate`, `diggability`, `collect`, `train`, `evaluate`.
+"""The command line: `wlplan plan`, `simulate`, `diggability`, `gradcheck`, `collect`, and so on.
 
 Results go to stdout, progress and remarks to stderr. Whatever is wrong with the input comes back as
 one line on stderr and exit code 2. What is slow to import is imported inside the commands, so that
@@ -32,6 +32,7 @@ from wlplan.units import ACTION_HIGH, ACTION_LOW
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
+    from wlplan.gradcheck import GradientCheck
     from wlplan.planner import PlanResult
     from wlplan.transport import Receiver
     from wlplan.types import Performance, Pile, World
@@ -613,6 +614,157 @@ def diggability(
         print(f"written: {folder / 'diggability.png'}, and diggability.json beside it")
 
 
+# --- gradcheck
+
+# Most loads whose gradient is checked: every component costs two rollouts, and in the simulator,
+# with its fixed number of steps, a rollout takes ten times as long.
+_MOST_CHECKED, _MOST_CHECKED_SIMULATOR = 50, 10
+_CHECK_FORMAT = "wlplan.gradcheck/1"
+_VERDICTS = {"ok": ("ok", None), "kink": ("kink", "yellow"), "wrong": ("WRONG", "bold red")}
+
+
+@wlplan.command()
+@_pile_argument
+@_options(
+    click.option(
+        "--loads",
+        type=click.IntRange(1, _MOST_CHECKED),
+        default=5,
+        show_default=True,
+        help=f"Number of bucket loads; at most {_MOST_CHECKED_SIMULATOR} in the simulator.",
+    ),
+    _world_option,
+    click.option(
+        "--objective",
+        type=click.Choice(OBJECTIVES),
+        default="efficiency",
+        show_default=True,
+        help="What the plan costs.",
+    ),
+    click.option(
+        "--step",
+        type=click.FloatRange(1e-9, 1e-3),
+        default=1e-6,
+        show_default=True,
+        help="Step of the differences, in m, rad or the unit of the action parameter.",
+    ),
+    click.option(
+        "--tolerance",
+        type=click.FloatRange(1e-9, 1.0),
+        default=None,
+        help="Relative error above which a component counts as wrong. Default: 1e-4; in the "
+        "simulator, where the derivative of the earthmoving force is approximate, 3e-3.",
+    ),
+    _model_option,
+    _out_option,
+)
+def gradcheck(
+    pile_file: str,
+    loads: int,
+    world_name: str,
+    objective: str,
+    step: float,
+    tolerance: float | None,
+    model: str | None,
+    out: str | None,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Compare the gradient of a plan's cost with central differences, in float64.
+
+    The plan is random, along the toe of PILE, its digs so close that each feels those before. A
+    component where the cost has a kink is named as such. Ends with exit code 1 if a component is
+    wrong. With --out: gradcheck.json.
+    """
+    _check_pile_name(pile_file)
+    _check_model(model, world_name)
+    in_simulator = world_name == "simulator"
+    if in_simulator and loads > _MOST_CHECKED_SIMULATOR:
+        raise InputError(
+            f"--loads {loads} takes too long in the simulator: ask for at most "
+            f"{_MOST_CHECKED_SIMULATOR}, or check another world."
+        )
+    folder = None if out is None else _checked_folder(out)
+
+    from wlplan.gradcheck import SIMULATOR_TOLERANCE, TOLERANCE, check_gradient, random_plan
+    from wlplan.io import plan_to_dict
+    from wlplan.objective import objective_named
+    from wlplan.planner.job import Job
+
+    if tolerance is None:
+        tolerance = SIMULATOR_TOLERANCE if in_simulator else TOLERANCE
+    pile, source = _read_pile(pile_file)
+    world, receiver = _load_world(world_name, model), _receiver(pile, None)
+    checked_plan = random_plan(pile, loads, seed=seed)
+    with _Progress() as progress, _Stopwatch() as checking:
+        check = check_gradient(
+            Job(world, pile, receiver, objective_named(objective)),
+            checked_plan,
+            step=step,
+            tolerance=tolerance,
+            progress=lambda done, total: progress("components", done, total, None),
+        )
+
+    document = {
+        "format": _CHECK_FORMAT,
+        "pile": source,
+        "world": world_name,
+        **({} if model is None else {"model": model}),
+        "objective": objective,
+        "seed": seed,
+        "receiver": _receiver_fields(receiver),
+        "loads": plan_to_dict(checked_plan)["loads"],
+        **check.as_dict(),
+    }
+    text = _json_text(document)
+    if folder is not None:
+        from wlplan.io import write_text_atomic
+
+        with _staged(folder) as staging:
+            write_text_atomic(staging / "gradcheck.json", text + "\n")
+    if as_json:
+        click.echo(text)
+    else:
+        _print_check(check, f"{loads} loads from {source['file']}, {world_name} world")
+        print(f"gradient and differences {checking.text()}")
+        if folder is not None:
+            print(f"written: {folder / 'gradcheck.json'}")
+    if check.with_verdict("wrong"):
+        raise click.exceptions.Exit(1)
+
+
+def _print_check(check: GradientCheck, title: str) -> None:
+    """The components of a gradient as a table on stdout, with what is worth knowing of them."""
+    table = _table(title)
+    for column in ("load", "component", "reverse", "central", "rel. error", "verdict"):
+        table.add_column(column, justify="left" if column == "component" else "right")
+    for c, after in zip(check.components, (*check.components[1:], None), strict=True):
+        table.add_row(
+            str(c.load),
+            c.component,
+            f"{c.reverse:.6g}",
+            f"{c.central:.6g}",
+            f"{c.relative_error:.1e}",
+            _VERDICTS[c.verdict][0],
+            style=_VERDICTS[c.verdict][1],
+            end_section=after is None or after.load != c.load,
+        )
+    _print_table(table)
+    kinks, wrong = check.with_verdict("kink"), check.with_verdict("wrong")
+    count = len(check.components)
+    print(
+        f"{count} components: {count - len(kinks) - len(wrong)} ok, {len(kinks)} at kinks "
+        f"({100.0 * check.kink_fraction:.1f} %), {len(wrong)} wrong"
+    )
+    for word, named in (("at kinks", kinks), ("WRONG", wrong)):
+        if named:
+            print(f"{word}: {', '.join(f'load {c.load} {c.component}' for c in named)}")
+    print(
+        f"relative error, kinks left out: largest {check.largest_error:.1e}, "
+        f"median {check.median_error:.1e}; tolerance {check.tolerance:g}"
+    )
+
+
 # --- data and models
 
 
@@ -735,6 +887,109 @@ def _print_errors(title: str, report: Mapping[str, Any]) -> None:
             cells = (write(part[key][q], unit) for q, (_, unit, _) in _QUANTITIES.items())
             table.add_row(f"{label}, {which}", str(part["cycles"]), *cells)
     _print_table(table)
+
+
+# --- bench
+
+# Names that wlplan.bench defines, repeated here to keep help fast; a test compares them.
+BENCH_ITEMS = (
+    *("avalanche", "avalanche-gradient", "avalanche-batch", "loading", "rollout"),
+    *("rollout-gradient", "psi-low", "psi-low-batch", "gpu-rollouts", "cycles", "plan"),
+    *("first-load", "settle", "xla", "numba", "numpy", "aeolis"),
+)
+# How the figures of an item are written.
+_BENCH_FIGURES: dict[str, Callable[[float], str]] = {
+    "steepest_slope_degrees": lambda v: f"at most {v:.2f}°",
+    "relative_volume_change": lambda v: f"volume to {v:.0e}",
+    "ratio_to_forward": lambda v: f"{v:.1f} × forward",
+    "ratio_to_one": lambda v: f"{v:.0f} × one",
+    "times_settle": lambda v: f"{v:.1f} × settle",
+    "sweeps": lambda v: f"{v:.0f} sweeps",
+    "seconds_each": lambda v: f"{_duration(v)} each",
+    "temporary_mebibytes": lambda v: f"{v:.0f} MiB",
+    "cycles_per_second": lambda v: f"{v:.0f} a second",
+    "loads_per_second": lambda v: f"{v:.0f} loads a second",
+    "seconds_on_another_pile": lambda v: f"{_duration(v)} on another pile",
+}
+
+
+@wlplan.command()
+@_options(
+    click.option(
+        "--only",
+        "names",
+        type=click.Choice(BENCH_ITEMS),
+        metavar="NAME",
+        multiple=True,
+        help=f"Item to measure, may be given again: {', '.join(BENCH_ITEMS)}. Default: all.",
+    ),
+    click.option("--quick", is_flag=True, help="Fewer cases and repeats, and no whole plans."),
+    _out_option,
+)
+def bench(names: tuple[str, ...], quick: bool, out: str | None, seed: int, as_json: bool) -> None:
+    """Measure on this machine what the package is measured by, beside what there is to beat.
+
+    Compiling and running are timed apart. With --out: bench.json.
+    """
+    folder = None if out is None else _checked_folder(out)
+
+    from wlplan.bench import run_bench
+
+    with _Progress() as progress:
+        document = run_bench(names, quick=quick, seed=seed, progress=progress)
+    text = _json_text(document)
+    if folder is not None:
+        from wlplan.io import write_text_atomic
+
+        with _staged(folder) as staging:
+            write_text_atomic(staging / "bench.json", text + "\n")
+    if as_json:
+        click.echo(text)
+        return
+    _print_bench(document)
+    if folder is not None:
+        print(f"written: {folder / 'bench.json'}")
+
+
+def _print_bench(document: Mapping[str, Any]) -> None:
+    """What was measured as a table on stdout, a group after the other."""
+    device, versions = document["device"], document["versions"]
+    table = _table(
+        f"{device['processor']}, {device['cores']} cores; JAX {versions['jax']} on {device['kind']}"
+    )
+    table.add_column("item", min_width=28)
+    for column in ("compile", "run,\nmedian", "10th to 90th\npercentile", "runs"):
+        table.add_column(column, justify="right")
+    table.add_column("found", min_width=20)
+    for column in ("to reach", "met", "others"):
+        table.add_column(column)
+    records = document["items"]
+    for record, after in zip(records, (*records[1:], None), strict=True):
+        run = record["run"]
+        cells = ["", "", "", ""]
+        if run is not None:
+            compiling = "" if record["compile"] is None else _duration(record["compile"])
+            spread = f"{_duration(run['p10'])} to {_duration(run['p90'])}"
+            cells = [compiling, _duration(run["median"]), spread, str(run["repeats"])]
+        found = [_BENCH_FIGURES[name](value) for name, value in record["figures"].items()]
+        table.add_row(
+            f"{record['name']}\n{record['title']}",
+            *cells,
+            record["note"] or ", ".join(found),
+            record["target"] or "",
+            {True: "yes", False: "no", None: ""}[record["met"]],
+            record["reference"] or "",
+            end_section=after is None or after["group"] != record["group"],
+        )
+    _print_table(table)
+    print("Targets are for two CPU cores. What others take was measured elsewhere or published.")
+
+
+def _duration(seconds: float) -> str:
+    """A time in the unit that suits it."""
+    unit, scale = ("s", 1.0) if seconds >= 1.0 else ("ms", 1e3) if seconds >= 1e-3 else ("µs", 1e6)
+    value = seconds * scale
+    return f"{value:.{0 if value >= 100.0 else 1 if value >= 10.0 else 2}f} {unit}"
 
 
 # --- checks that need nothing heavy
