@@ -57,14 +57,14 @@ class Schedule:
     The defaults are the quickest that were found for bucket loads, see docs/automaton.md.
     """
 
-    sweeps: tuple[int, ...] = (12, 16, 20)
+    sweeps: tuple[int, ...] = (6, 8, 10)
     # Part of the velocity that is kept from sweep to sweep.
     momentum: float = 0.9
     # How much steeper than the angle of repose the result may be [rad].
     tolerance: float = math.radians(1.0)
-    # It gives up after this many rounds. Bucket loads take two or three; 35 were seen on a slope
+    # It gives up after this many rounds. Bucket loads take about four; 67 were seen on a slope
     # longer than the window.
-    most_rounds: int = 50
+    most_rounds: int = 100
 
     @property
     def block(self) -> int:
@@ -438,7 +438,7 @@ def relax(
 
 
 # `relax` gives up after this many rounds; a tall cliff across a 20 m grid needs about half.
-_MOST_ROUNDS = 100
+_MOST_ROUNDS = 200
 
 
 def _settled(pile: Pile, dug: Array, start: Array, repose_angle: float, schedule: Schedule) -> Pile:
