@@ -26,7 +26,8 @@ _RISE = math.tan(math.radians(45.0))
 # The strip ends here [m]: the largest penetration, 3.2 m (paper, section 5.2), and the rise of a
 # bucket that breaks out.
 STRIP_LENGTH = 4.5
-_BISECTIONS, _NEWTON_STEPS = 9, 3
+# Bisection down to 4 micrometres: further off, a thin layer may have no edge to find the rate at.
+_BISECTIONS, _NEWTON_STEPS = 20, 1
 
 
 class Strip(NamedTuple):
@@ -91,7 +92,8 @@ def excavate(
         short = cut(middle, frozen).sum() < goal
         return jnp.where(short, middle, low), jnp.where(short, high, middle)
 
-    deepest = jnp.full_like(goal, STRIP_LENGTH)
+    # The soft end of the strip reaches half a cell further; there, all that is held can be cut.
+    deepest = jnp.full_like(goal, STRIP_LENGTH + pile.cell_size)
     shallowest = -jnp.maximum(frozen.above.max() / _RISE, pile.cell_size)
     low, high = lax.fori_loop(0, _BISECTIONS, bisect, (shallowest, deepest))
 

@@ -143,15 +143,22 @@ def take(
     piecewise linear function; the last, differentiable step carries the implicit gradient.
     """
 
-    def newton(scale: Array, wanted: Array, available: Array, total: Array) -> Array:
-        amount = jnp.minimum(scale * wanted, available).sum()
-        slope = lax.stop_gradient(jnp.where(scale * wanted < available, wanted, 0.0).sum())
-        step = jnp.where(slope > 0.0, (total - amount) / jnp.where(slope > 0.0, slope, 1.0), 0.0)
-        return jnp.clip(scale + step, 0.0, _LARGEST_SCALE)
+    def newton(scale: Array, wanted: Array, available: Array, total: Array) -> tuple[Array, Array]:
+        """The next scale, and which cells follow it; the others give all they have."""
+        amount = scale * wanted
+        short = jnp.minimum(amount, available).sum() < total
+        # A cell that is just used up follows the scale down, not up. Rate and result have to agree
+        # on that: or a cell with next to nothing in it makes a rate that others multiply.
+        follows = jnp.where(short, amount < available, amount <= available)
+        rate = lax.stop_gradient(jnp.where(follows, wanted, 0.0).sum())
+        missing = total - jnp.where(follows, amount, available).sum()
+        step = jnp.where(rate > 0.0, missing / jnp.where(rate > 0.0, rate, 1.0), 0.0)
+        return jnp.clip(scale + step, 0.0, _LARGEST_SCALE), follows
 
     frozen = lax.stop_gradient((wanted, available, total))
-    scale = lax.fori_loop(0, 4, lambda _, s: newton(s, *frozen), jnp.ones_like(frozen[2]))
-    return jnp.minimum(newton(scale, wanted, available, total) * wanted, available)
+    scale = lax.fori_loop(0, 4, lambda _, s: newton(s, *frozen)[0], jnp.ones_like(frozen[2]))
+    scale, follows = newton(scale, wanted, available, total)
+    return jnp.minimum(jnp.where(follows, scale * wanted, available), available)
 
 
 # Where nothing is left to take, the scale would grow without bound.
