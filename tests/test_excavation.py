@@ -56,6 +56,20 @@ def test_a_load_larger_than_the_strip_takes_what_is_there():
     assert lost == pytest.approx(float(taken), rel=1e-5)
 
 
+@pytest.mark.parametrize("cell", [0.1, 0.2])
+@pytest.mark.parametrize("part", [0.3, 0.7, 2.0])
+def test_a_thin_layer_gives_what_was_taken(cell, part):
+    """The cut rises by more than the layer from one cell to the next."""
+    cells = round(10.0 / cell)
+    pile = Pile(jnp.full((cells, cells), 0.05), cell)
+    volume = part * 0.05 * STRIP_LENGTH * WIDTH
+    for x in np.linspace(2.0, 2.2, 7):
+        after, taken = excavate(pile, pose(x, 5.0, 0.1), jnp.asarray(volume), width=WIDTH)
+        lost = np.asarray(pile.height - after.height, np.float64).sum() * cell**2
+        assert lost == pytest.approx(float(taken), rel=1e-4)
+        assert float(taken) == pytest.approx(volume / max(part, 1.0), rel=1e-2)
+
+
 @pytest.mark.parametrize("where", [(-30.0, 0.0), (1.0, 5.0)])
 def test_off_the_pile_nothing_is_taken_and_gradients_are_finite(where):
     pile = Pile(jnp.zeros((60, 60)), 0.1)

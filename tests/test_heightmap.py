@@ -140,6 +140,22 @@ def test_take_meets_its_total_and_respects_what_is_there():
     assert float(take(wanted, available, jnp.asarray(0.0)).sum()) == 0.0
 
 
+def test_cells_with_next_to_nothing_do_not_blow_up_the_gradient_of_take():
+    """All but a few cells are just used up; what those few hold is below the rounding."""
+    rng = np.random.default_rng(0)
+    weight = jnp.asarray(rng.normal(size=(6, 5)), jnp.float32)
+    gradient = jax.jit(
+        jax.grad(lambda w, a: (weight * take(w, a, a.sum())).sum(), argnums=(0, 1)),
+    )
+    for _ in range(50):
+        available = rng.random((6, 5)).astype(np.float32)
+        available[0] *= 1e-7
+        wanted = available.copy()
+        wanted[0] *= 0.5
+        for part in gradient(jnp.asarray(wanted), jnp.asarray(available)):
+            assert jnp.abs(part).max() < 10.0
+
+
 def test_take_is_differentiable():
     with jax.enable_x64(True):
         rng = np.random.default_rng(0)

@@ -315,14 +315,7 @@ def wild_rows(seed, plans, loads=2):
     return rows
 
 
-def with_floor(height):
-    """A sloping floor under a pile, and a corner that was not seen."""
-    i, j = np.indices((CELLS, CELLS))
-    ground = (0.02 * CELL * i).astype(np.float32)
-    return {"ground": jnp.asarray(ground), "valid": jnp.asarray(i + j > 12)}, height + ground
-
-
-@pytest.mark.parametrize(
+ANY_PLAN = pytest.mark.parametrize(
     ("plans", "floor"),
     [
         (200, False),
@@ -330,34 +323,64 @@ def with_floor(height):
         pytest.param(2_000, True, marks=pytest.mark.slow),
     ],
 )
-def test_gradients_are_finite_for_any_plan(low, plans, floor):
-    piles = jnp.asarray(small_piles())
-    fields = {}
-    if floor:
-        fields, piles = with_floor(piles)
 
-    def check(case):
+
+def each_wild_plan(function, plans, floor):
+    """`function(pile, plan)` of random plans, leaves [plans], and what those were, for messages.
+
+    Args:
+        function: Of one pile and one plan.
+        plans: How many.
+        floor: Whether there is a sloping floor under the piles, and a corner that was not seen.
+    """
+    heights, fields = jnp.asarray(small_piles()), {}
+    if floor:
+        i, j = np.indices((CELLS, CELLS))
+        fields = {"ground": jnp.asarray(0.02 * CELL * i, jnp.float32), "valid": i + j > 12}
+        heights = heights + fields["ground"][None]
+    rows = wild_rows(1, plans)
+    # Every pile with both kinds of plan.
+    which = np.arange(plans) // 2 % len(heights)
+
+    def one(case):
+        k, plan = case
+        return function(Pile(heights[k], CELL, jnp.asarray(SIDE[[0, 0]]), **fields), plan)
+
+    # One after the other: on a CPU a batch would only make the slowest member's work for all.
+    run = jax.jit(lambda *cases: jax.lax.map(one, cases))
+    results = jax.tree.map(np.asarray, run(jnp.asarray(which), plan_of(rows)))
+    return results, [f"pile {k}, {row}" for k, row in zip(which, rows, strict=True)]
+
+
+@ANY_PLAN
+def test_gradients_are_finite_for_any_plan(low, plans, floor):
+    def check(pile, plan):
         """Whether the cost and its gradient in plan and heights are finite, and its largest."""
-        plan, which = case
 
         def cost(plan, height):
-            return cost_in(low, Pile(height, CELL, jnp.asarray(SIDE[[0, 0]]), **fields))(plan)
+            return cost_in(low, pile.replace(height=height))(plan)
 
-        results = jax.value_and_grad(cost, argnums=(0, 1))(plan, piles[which])
-        leaves = jax.tree.leaves(results)
+        leaves = jax.tree.leaves(jax.value_and_grad(cost, argnums=(0, 1))(plan, pile.height))
         finite = jnp.stack([jnp.isfinite(leaf).all() for leaf in leaves]).all()
         return finite, jnp.stack([jnp.abs(leaf).max() for leaf in leaves]).max()
 
-    # One after the other: on a CPU a batch would only make the slowest member's work for all.
-    run = jax.jit(lambda *cases: jax.lax.map(check, cases))
-    rows = wild_rows(1, plans)
-    # Every pile with both kinds of plan.
-    which = np.arange(plans) // 2 % len(piles)
-    finite, largest = (np.asarray(v) for v in run(plan_of(rows), jnp.asarray(which)))
-    worst = np.flatnonzero(~finite)
-    assert finite.all(), f"{worst.size} of {plans}: pile {which[worst[0]]}, {rows[worst[0]]}"
-    assert largest.max() < 1e4
+    (finite, largest), cases = each_wild_plan(check, plans, floor)
+    assert finite.all(), f"{(~finite).sum()} of {plans}: {cases[finite.argmin()]}"
+    # What an almost empty bucket costs is steep, but nothing more than that.
+    assert largest.max() < 1e5, cases[largest.argmax()]
     assert np.median(largest) > 0.0
+
+
+@ANY_PLAN
+def test_the_ledger_closes_for_any_plan(low, plans, floor):
+    def check(pile, plan):
+        outcome = rollout(low, pile, plan)
+        return pile.height, outcome.pile.height, outcome.performance.mass
+
+    (before, after, mass), cases = each_wild_plan(check, plans, floor)
+    lost = (before.astype(np.float64) - after).sum(axis=(1, 2)) * CELL**2 * DENSITY
+    error = np.abs(lost - mass.sum(axis=1))
+    assert error.max() < 2e-5, cases[error.argmax()]  # [tonne]
 
 
 @pytest.mark.parametrize("reverse", [False, pytest.param(True, marks=pytest.mark.slow)])
