@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import socket
+import threading
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,11 +39,10 @@ CYCLES, SEED = 11, 5
 
 @pytest.fixture(scope="module", autouse=True)
 def _short_rollouts():
-    """Rollouts of 3 loadings, one a group, two groups a batch: 11 cycles make two batches."""
+    """Rollouts of 3 loadings, two a batch: 11 cycles make two batches."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "LOADS", 3)
-        patch.setattr(module, "_GROUP", 1)
-        patch.setattr(module, "_GROUPS", 2)
+        patch.setattr(module, "_BATCH", 2)
         yield
 
 
@@ -134,43 +134,57 @@ def test_the_volume_that_the_map_loses_is_about_the_load(data):
     assert np.median(lost / data.mass) > 0.7
 
 
-def test_what_left_the_grid_is_the_load():
-    pile = seed_pile("conical", slope=math.radians(30.0), seed=1)
-    shape = module._grid_shape()
-    pile = module._on_grid(pile, shape)
-    pose, action = choose_pose(pile, 0.3, 0.05), np.array([0.3, 3.0, 0.2, 3.0], np.float32)
-    origin = np.asarray(pile.origin)
-    after, record = module._play(
-        Simulator(), origin, np.asarray(pile.height)[None], pose[None], action[None]
+def played(rollout):
+    """A rollout after all its loadings, alone on its bench."""
+    rollouts, finished = iter([rollout]), []
+    bench = module._Bench(
+        Simulator(), lambda: next(rollouts, None), finished.append, threading.Event()
     )
-    lost = np.sum(np.asarray(pile.height - after[0], np.float64)) * CELL_SIZE**2
-    assert lost * GRAVEL.density / 1000.0 == pytest.approx(float(record["mass"][0]), rel=1e-3)
+    bench.run()
+    assert finished == [None] * rollout.loads + [rollout]
+    return rollout
+
+
+def test_a_rollout_does_not_depend_on_those_beside_it(data):
+    for number in (0, 2):
+        alone = played(module._Rollout(number, SEED, 3, Simulator())).records()
+        for name in VARIABLES:
+            np.testing.assert_array_equal(alone[name], getattr(data, name)[data.rollout == number])
+
+
+def test_what_left_the_grid_is_the_load():
+    rollout = module._Rollout(3, SEED, 1, Simulator())
+    rollout.heap()
+    before, origin = rollout.height, rollout.origin
+    after = played(rollout).height
+    record = {name: values[0] for name, values in rollout.records().items()}
+    lost = np.sum(np.asarray(before - after, np.float64)) * CELL_SIZE**2
+    assert lost * GRAVEL.density / 1000.0 == pytest.approx(float(record["mass"]), rel=1e-3)
     # The map after is the sampled pile after, over the reference of the map before.
-    dug = Pile(after[0], CELL_SIZE, origin)
-    where = Pose(*(jnp.asarray(value) for value in pose))
+    dug = Pile(after, CELL_SIZE, origin)
+    where = Pose(*(jnp.asarray(value) for value in record["pose"]))
     want = sample_local(dug, where, cells=52, displacement=1.0).height
-    got = np.asarray(record["h52_after"][0])
+    got = record["h52_after"]
     offset = (got - want)[:4, :4].mean()  # at the level ground behind the dig location
     np.testing.assert_allclose(got - offset, want, atol=1e-4)
 
 
 def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike():
-    first, again, other = (module._Rollout(3, seed) for seed in (0, 0, 1))
+    first, again, other = (module._Rollout(3, seed, 3, Simulator()) for seed in (0, 0, 1))
     assert first.noise_seed == again.noise_seed != other.noise_seed
     np.testing.assert_array_equal(first.action, again.action)
     assert not np.any(first.place == other.place)
-    headings = np.concatenate([module._Rollout(n, 0).turn for n in range(60)])
+    headings = np.concatenate([module._Rollout(n, 0, 3, Simulator()).turn for n in range(60)])
     assert np.abs(headings).max() <= math.radians(10.0)
     assert headings.std() == pytest.approx(math.radians(20.0) / math.sqrt(12.0), rel=0.1)
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30, 31, 47, 449, 451, 1801, 10_718, 10_800])
 def test_the_batches_make_up_the_cycles(cycles, monkeypatch):
-    for name, value in (("LOADS", 30), ("_GROUP", 15), ("_GROUPS", 4)):
+    for name, value in (("LOADS", 30), ("_BATCH", 60)):
         monkeypatch.setattr(module, name, value)
     layout = module._Layout(cycles)
     assert layout.rollouts * 30 >= cycles > (layout.rollouts - 1) * 30
-    assert 1 <= layout.group <= 15
     # A batch starts with a rollout, and with a chunk.
     assert layout.batch_cycles == cycles or layout.batch_cycles % 30 == 0
 
@@ -232,6 +246,23 @@ def test_a_collection_that_was_cut_short_ends_with_the_same_bytes(store, tmp_pat
     refused(lambda: open_dataset(path), f"of {CYCLES} cycles", "again")
     collect(path, cycles=CYCLES, seed=SEED)
     assert contents(path) == contents(store)
+
+
+@pytest.mark.parametrize("cores", [1, 3])
+def test_the_number_of_cores_does_not_show(store, tmp_path, monkeypatch, cores):
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    collect(tmp_path / "data.zarr", cycles=CYCLES, seed=SEED)
+    assert contents(tmp_path / "data.zarr") == contents(store)
+
+
+def test_what_goes_wrong_beside_is_not_lost(tmp_path, monkeypatch):
+    def fails(*_):
+        raise RuntimeError("no toe")
+
+    monkeypatch.setattr(module, "choose_pose", fails)
+    with pytest.raises(RuntimeError, match="no toe"):
+        collect(tmp_path / "data.zarr", cycles=CYCLES, seed=SEED)
+    assert "collect" not in [thread.name for thread in threading.enumerate()]
 
 
 def test_a_batch_that_was_half_written_is_written_again(store, copy):

@@ -1,6 +1,7 @@
 """The simulator: ledgers, symmetries and trends of a loading; then values; then gradients."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +10,12 @@ import pytest
 from scipy import ndimage, stats
 
 from experiments.dem_reference import REFERENCE, replay
-from wlplan.automaton import relax, steepest_slope
+from wlplan.automaton import FLOW_FRACTION, relax, steepest_slope, sweep
 from wlplan.heightmap import local_axes
 from wlplan.machine import GRAVEL, WA320
 from wlplan.pile import SEED_PILES, seed_pile, toe_contour
-from wlplan.simulator import STOP_REASONS, Settings, Simulator, dig
+from wlplan.simulator import STOP_REASONS, Settings, Simulator, dig, terrain
+from wlplan.simulator.cycle import advance, begin, outcome
 from wlplan.types import Pile, Pose, action_from
 from wlplan.units import ACTION_HIGH, GRAVITY
 
@@ -384,6 +386,43 @@ def test_a_drive_into_nothing_has_a_closed_form(digs):
     assert cycle.fill_time == pytest.approx(fill, rel=1e-2)
     assert cycle.time == pytest.approx(5.0 / speed + fill + max(tilting, 0.5) + back, rel=1e-2)
     assert cycle.work_slip == 0.0
+
+
+def test_soil_slides_by_the_rule_of_the_automaton():
+    surface = np.stack([bumpy(k, slope=40.0) for k in range(3)], axis=-1)
+    rim = terrain.rimmed(jnp.asarray(surface))
+    flow = terrain._outflow(rim, jnp.ones_like(rim), 0.06, 10.0)
+    want = jax.vmap(lambda h: sweep(h, 0.06), in_axes=-1, out_axes=-1)(surface)
+    assert np.abs(want - surface).max() > 1e-3
+    np.testing.assert_allclose(surface - FLOW_FRACTION * flow, want, atol=1e-6)
+    # No cell gives more than it may, nor more than it lets go.
+    part = 0.3 * jnp.ones_like(rim)
+    np.testing.assert_allclose(terrain._outflow(rim, part, 0.06, 10.0), 0.3 * flow, atol=1e-6)
+    assert np.abs(terrain._outflow(rim, part, 0.06, 1e-3)).max() <= 8 * 0.3e-3 + 1e-8
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 12, 13, 28, 52])
+def test_a_sum_by_halves_is_the_sum(count):
+    values = np.random.default_rng(count).normal(size=(count, 3))
+    np.testing.assert_allclose(terrain.total(jnp.asarray(values)), values.sum(0), atol=1e-5)
+
+
+def test_cycles_advanced_in_parts_end_alike(digs):
+    """A few steps at a time, in one go, and next to others that took longer: the same bytes."""
+    rng = np.random.default_rng(5)
+    height = jnp.asarray(np.stack([bumpy(k) for k in range(8)], axis=-1))
+    action = action_from(jnp.asarray(random_actions(rng, 8)))
+    state = begin(height, jnp.zeros_like(height), action, WA320)
+    options = {"machine": WA320, "soil": GRAVEL, "settings": Settings()}
+    part, whole = (jax.jit(partial(advance, **options, steps=n)) for n in (7, 2000))
+    once = whole(state)
+    while not state.has_ended.all():
+        state = part(state)
+    for one, other in zip(*map(jax.tree.leaves, (state, once)), strict=True):
+        np.testing.assert_array_equal(one, other)
+    mass = outcome(state, machine=WA320, soil=GRAVEL).mass
+    want = digs([bumpy(k) for k in range(8)], np.stack(jax.tree.leaves(action), axis=-1)).mass
+    np.testing.assert_allclose(mass, want, rtol=1e-5)
 
 
 # --- Against the discrete elements: a guard against regressions, not a validation. --------------

@@ -104,9 +104,6 @@ def sweep(
     height: Float[Array, "nx ny"],
     drop: float,
     active: Bool[Array, "nx ny"] | None = None,
-    *,
-    largest: float | None = None,
-    giving: Float[Array, "nx ny"] | None = None,
 ) -> Float[Array, "nx ny"]:
     """One sweep of the automaton.
 
@@ -114,22 +111,9 @@ def sweep(
         height: Surface [m].
         drop: Largest stable height difference between two cells that share a side [m].
         active: Cells that take part; None: all.
-        largest: Largest excess height that counts [m]; bounds the flow where a sweep stands for
-            a span of time; None: no bound.
-        giving: Part of its outflow that each cell lets go; None: all.
     """
-    around = _rim(height)
-    giving_around = _rim(jnp.ones_like(height) if giving is None else giving)
     links = None if active is None else _links(active)
-    outflow = jnp.zeros_like(height)
-    for (i, j), bit in zip(_NEIGHBOURS, _BITS, strict=True):
-        flow = _excess(height, _around(around, i, j), drop * math.hypot(i, j))
-        if largest is not None:
-            flow = jnp.clip(flow, -largest, largest)
-        if giving is not None:
-            flow = flow * jnp.where(flow > 0.0, giving, _around(giving_around, i, j))
-        outflow = outflow + (flow if links is None else jnp.where(links & bit != 0, flow, 0.0))
-    return height - FLOW_FRACTION * outflow
+    return height - FLOW_FRACTION * _outflow(_rim(height), drop, links)
 
 
 def _excess(height: Array, neighbour: Array, limit: float) -> Array:

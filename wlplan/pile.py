@@ -316,17 +316,24 @@ def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
     if not 0.0 < rise < math.inf:
         raise InputError(f"The rise is {rise:g} m: it has to be positive.")
     cell = pile.cell_size
-    above = np.asarray(pile.height, np.float64) - np.asarray(ground_height(pile), np.float64)
-    labels, count = ndimage.label(above > rise)
+    above = np.asarray(pile.height, np.float64)
+    if pile.ground is not None:
+        above = above - np.asarray(pile.ground, np.float64)
+    # Only the part of the map that holds what is higher, with a border of what is not.
+    higher = above > rise
+    part = tuple(_span(np.flatnonzero(higher.any(axis=axis))) for axis in (1, 0))
+    near = above[part]
+    labels, count = ndimage.label(higher[part])
     if count == 0:
         raise InputError(
             f"Nothing to dig: no cell lies more than {rise:g} m above the ground; check the units "
             f"and the ground of the scan."
         )
-    volumes = np.bincount(labels.ravel(), weights=above.ravel())[1:] * cell**2
+    volumes = np.bincount(labels.ravel(), weights=near.ravel())[1:] * cell**2
     largest = labels == 1 + int(np.argmax(volumes))
     # The cells on the rim span the same extent as all, and are far fewer.
-    rim = largest & ~ndimage.binary_erosion(largest)
+    around = np.pad(largest, 1)
+    rim = largest & ~(around[2:, 1:-1] & around[:-2, 1:-1] & around[1:-1, 2:] & around[1:-1, :-2])
     extent = _largest_extent(np.argwhere(rim) * cell) + cell
     if volumes.max() < _SMALLEST_VOLUME or extent < WA320.bucket_width:
         raise InputError(
@@ -334,11 +341,12 @@ def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
             f"long; a bucket needs {_SMALLEST_VOLUME:g} m^3 and {WA320.bucket_width:g} m."
         )
     # Other piles are sunk and hollows are filled to just the other side of the level.
-    solid = ndimage.binary_fill_holes(largest)
-    alone = np.where(solid, above, np.minimum(above, rise - 1e-6))
+    # What is outside is in one piece, unless there are hollows or the pile runs over the edge.
+    solid = largest if ndimage.label(~largest)[1] == 1 else ndimage.binary_fill_holes(largest)
+    alone = np.where(solid, near, np.minimum(near, rise - 1e-6))
     alone = np.where(solid & ~largest, np.maximum(alone, rise + 1e-6), alone)
     origin = np.asarray(pile.origin, np.float64)
-    x, y = (origin[axis] + cell * np.arange(above.shape[axis]) for axis in (0, 1))
+    x, y = (origin[k] + cell * np.arange(above.shape[k])[part[k]] for k in (0, 1))
     lines = contourpy.contour_generator(x, y, alone.T).lines(rise)
     line = max((np.asarray(line) for line in lines), key=_line_length)
     closed = bool(np.all(line[0] == line[-1])) and len(line) > 2
@@ -360,6 +368,11 @@ def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
     )
     heading = np.arctan2(normal[:, 1], normal[:, 0])
     return ToeContour(points, heading, float(length), closed, accessible)
+
+
+def _span(indices: Int[np.ndarray, " n"]) -> slice:
+    """From just before the first of some ascending indices to just after the last."""
+    return slice(max(indices[0] - 1, 0), indices[-1] + 2) if len(indices) else slice(0, 0)
 
 
 def evenly_spaced(contour: ToeContour, n: int) -> Int[np.ndarray, " n"]:

@@ -13,8 +13,8 @@ SMOOTHING_TIME = 0.05
 
 
 def command(
-    action: Action, boom_force: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    action: Action, boom_force: Float[Array, "*b"]
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """Target speeds of boom and bucket as parts of their maxima. Paper, section 5.2.
 
     Args:
@@ -27,6 +27,8 @@ def command(
     )
 
 
-def smooth(value: Float[Array, ""], target: Float[Array, ""], step: float) -> Float[Array, ""]:
+def smooth(
+    value: Float[Array, "*b"], target: Float[Array, "*b"], step: float
+) -> Float[Array, "*b"]:
     """First-order lag over one time step [s]."""
     return value + (target - value) * (step / (SMOOTHING_TIME + step))

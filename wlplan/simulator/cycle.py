@@ -3,21 +3,25 @@
 Time marches in fixed steps while the bucket is in the soil; the approach before it and the retreat
 after it have closed forms. An event that ends a phase is located inside its step and the state
 interpolated to it, so that outcomes are continuous in the inputs.
+
+Cycles are computed side by side, the last axis of every array: `begin` some, `advance` them by a
+few steps at a time, and take each one's `outcome` when it `has_ended`. `dig` does it all for one.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import no_type_check
+from collections.abc import Callable, Sequence
+from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from wlplan.heightmap import STATE_CELLS, STATE_DISPLACEMENT, local_axes
+from wlplan.heightmap import STATE_DISPLACEMENT
 from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
 from wlplan.simulator import controller, loader, terrain
 from wlplan.types import Action
@@ -72,52 +76,81 @@ class Cycle(struct.PyTreeNode):
 
 @no_type_check
 class State(struct.PyTreeNode):
-    """What the time stepping carries."""
+    """What the time stepping carries of cycles side by side."""
 
-    height: Float[Array, "52 52"]
-    fill: Float[Array, "52"]  # soil in each lane of the bucket [m^3]
-    time: Float[Array, ""]
-    position: Float[Array, ""]
-    speed: Float[Array, ""]
-    boom: Float[Array, ""]
-    tilt: Float[Array, ""]
-    reach: Float[Array, ""]  # furthest position of the cutting edge [m]
-    boom_force: Float[Array, ""]  # smoothed, over the nominal force [1]
-    boom_command: Float[Array, ""]
-    tilt_command: Float[Array, ""]
-    dig_start: Float[Array, ""]  # time at which the edge reached the dig location [s]
-    stop_time: Float[Array, ""]
-    stop_x: Float[Array, ""]
-    stop_z: Float[Array, ""]
-    work_drive: Float[Array, ""]
-    work_boom: Float[Array, ""]
-    work_bucket: Float[Array, ""]
-    work_slip: Float[Array, ""]
-    stop_reason: Int[Array, ""]
-    phase: Int[Array, ""]  # 0 filling (approach included), 1 stopped, 2 ended
+    height: Float[Array, "54 54 b"]  # with its rim, see `terrain` [m]
+    ground: Float[Array, "54 54 b"]  # likewise; does not change
+    profile: Float[Array, "52 b"]  # surface before, across the bucket; does not change [m]
+    action: Action  # does not change
+    fill: Float[Array, "lanes b"]  # soil in each lane of the bucket [m^3]
+    time: Float[Array, " b"]
+    position: Float[Array, " b"]
+    speed: Float[Array, " b"]
+    boom: Float[Array, " b"]
+    tilt: Float[Array, " b"]
+    reach: Float[Array, " b"]  # furthest position of the cutting edge [m]
+    boom_force: Float[Array, " b"]  # smoothed, over the nominal force [1]
+    boom_command: Float[Array, " b"]
+    tilt_command: Float[Array, " b"]
+    dig_start: Float[Array, " b"]  # time at which the edge reached the dig location [s]
+    stop_time: Float[Array, " b"]
+    stop_x: Float[Array, " b"]
+    stop_z: Float[Array, " b"]
+    work_drive: Float[Array, " b"]
+    work_boom: Float[Array, " b"]
+    work_bucket: Float[Array, " b"]
+    work_slip: Float[Array, " b"]
+    stop_reason: Int[Array, " b"]
+    phase: Int[Array, " b"]  # 0 filling (approach included), 1 stopped, 2 ended
+
+    @property
+    def has_ended(self) -> Bool[Array, " b"]:
+        """Whether a further step changes nothing."""
+        return self.phase == _ENDED
+
+    def ended(self) -> State:
+        """The same with all cycles at an end."""
+        return self.replace(phase=jnp.full_like(self.phase, _ENDED))
 
 
 _FILLING, _STOPPED, _ENDED = 0, 1, 2
 
 
-def _initial(height: Array, machine: WheelLoader) -> State:
-    """The bucket level on the ground at the near edge of the heightfield, at travel speed."""
+def begin(
+    height: Float[Array, "52 52 b"],
+    ground: Float[Array, "52 52 b"],
+    action: Action,
+    machine: WheelLoader,
+) -> State:
+    """Cycles about to begin: bucket level, at the near edge of the heightfield, at travel speed.
+
+    Args:
+        height: Heights in the local frames of the dig poses, see `dig` [m].
+        ground: Floors under the piles in the same frames [m].
+        action: Parameters of the bucket-filling controller, leaves of shape [b].
+        machine: Machine parameters.
+    """
     dtype = height.dtype
-    zero = jnp.zeros((), dtype)
-    start = jnp.asarray(-STATE_DISPLACEMENT, dtype)
+    width = terrain.lane_widths(machine)
+    zero = jnp.zeros(height.shape[2], dtype)
+    count = jnp.zeros(height.shape[2], jnp.int32)
+    start = zero - STATE_DISPLACEMENT
     travelled = machine.approach_distance - STATE_DISPLACEMENT
     rolling = machine.rolling_resistance * machine.mass * GRAVITY * travelled
-    rest = loader.boom_force(machine, jnp.asarray(machine.boom_low, dtype), zero, zero)
+    boom = zero + machine.boom_low
     return State(
-        height=height,
-        fill=jnp.zeros(height.shape[1], dtype),
+        height=terrain.rimmed(height),
+        ground=terrain.rimmed(ground),
+        profile=jnp.einsum("ijb,j->ib", height, jnp.asarray(width / width.sum(), dtype)),
+        action=jax.tree.map(lambda part: jnp.asarray(part, dtype), action),
+        fill=jnp.zeros((terrain.Lanes(machine).count, height.shape[2]), dtype),
         time=zero + travelled / machine.travel_speed,
         position=start,
         speed=zero + machine.travel_speed,
-        boom=zero + machine.boom_low,
+        boom=boom,
         tilt=zero,
         reach=start,
-        boom_force=rest / machine.boom_force_nominal,
+        boom_force=loader.boom_force(machine, boom, zero, zero) / machine.boom_force_nominal,
         boom_command=zero,
         tilt_command=zero,
         dig_start=zero + machine.approach_distance / machine.travel_speed,
@@ -128,25 +161,52 @@ def _initial(height: Array, machine: WheelLoader) -> State:
         work_boom=zero,
         work_bucket=zero,
         work_slip=zero,
-        stop_reason=jnp.zeros((), jnp.int32),
-        phase=jnp.zeros((), jnp.int32),
+        stop_reason=count,
+        phase=count,
     )
 
 
-def _advance(
-    state: State,
-    action: Action,
-    profile: Array,
-    ground: Array,
-    machine: WheelLoader,
-    soil: Soil,
-    step: float,
+def advance(
+    state: State, *, machine: WheelLoader, soil: Soil, settings: Settings, steps: int
 ) -> State:
+    """At most `steps` time steps; it stops early when all cycles have ended."""
+
+    def more(counted: tuple[State, Array]) -> Array:
+        return (counted[1] < steps) & ~counted[0].has_ended.all()
+
+    def step(counted: tuple[State, Array]) -> tuple[State, Array]:
+        return _step(counted[0], machine, soil, settings.step), counted[1] + 1
+
+    return lax.while_loop(more, step, (state, jnp.zeros((), jnp.int32)))[0]
+
+
+def outcome(state: State, *, machine: WheelLoader, soil: Soil) -> Cycle:
+    """The records of cycles that have ended, leaves with the cycles as their last axis."""
+    mass = terrain.total(state.fill) * soil.density
+    time, drive, boom = loader.retreat(machine, state.position, state.boom, mass)
+    return Cycle(
+        mass=mass,
+        time=state.time + time,
+        work_drive=state.work_drive + drive,
+        work_boom=state.work_boom + boom,
+        work_bucket=state.work_bucket,
+        work_slip=state.work_slip,
+        fill_time=state.stop_time - state.dig_start,
+        stop_reason=state.stop_reason,
+        tip_x=state.stop_x,
+        tip_z=state.stop_z,
+        height=state.height[1:-1, 1:-1],
+    )
+
+
+def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     """One time step, cut short at the first event inside it."""
     filling = state.phase == _FILLING
+    wanted = ~state.has_ended.all()
     x, z = loader.bucket_tip(machine, state.position, state.boom, state.tilt)
     bucket = terrain.Bucket(x, z, state.tilt)
-    soil_force = terrain.reaction(machine, soil, state.height, state.fill, bucket)
+    soil_force = terrain.reaction(machine, soil, state.height, state.fill, bucket, wanted)
+    soil_force = terrain.stored(soil_force, wanted)
     load = soil_force.content_mass * GRAVITY
     vertical = soil_force.vertical
 
@@ -165,7 +225,7 @@ def _advance(
     # Controller and actuators.
     force = loader.boom_force(machine, state.boom, vertical + load, horizontal)
     boom_force = controller.smooth(state.boom_force, force / machine.boom_force_nominal, step)
-    boom_target, tilt_target = controller.command(action, boom_force)
+    boom_target, tilt_target = controller.command(state.action, boom_force)
     # Engaged when the edge reaches the dig location; a short ramp keeps this continuous.
     engaged = jnp.clip(x / CELL_SIZE + 0.5, 0.0, 1.0)
     boom_target = jnp.where(filling, engaged * boom_target, 0.0)
@@ -187,10 +247,11 @@ def _advance(
         soil,
         state.height,
         state.fill,
-        ground,
+        state.ground,
         terrain.Bucket(new_x, new_z, tilt),
         (state.reach, reach),
         step,
+        wanted,
     )
 
     trial = state.replace(
@@ -213,7 +274,7 @@ def _advance(
 
     # Events: each is a margin that reaches zero.
     def surface_margin(tip_x: Array, tip_z: Array) -> Array:
-        surface = jnp.interp(tip_x, jnp.asarray(_ALONG, profile.dtype), profile)
+        surface = _interpolated(state.profile, tip_x)
         early = jnp.maximum(_BREAKOUT_FROM - tip_x, 0.0)
         return surface + _BREAKOUT_CLEARANCE + early - tip_z
 
@@ -234,11 +295,11 @@ def _advance(
             deadline - trial.time,
         ]
     )
-    crossed = (new_margins <= 0.0) & filling
+    crossed = (new_margins <= 0.0) & filling[None]
     drop = jnp.where(crossed, jnp.maximum(old_margins - new_margins, 1e-9), 1.0)
     part = jnp.where(crossed, jnp.clip(old_margins / drop, 0.0, 1.0), 1.0)
-    reason = jnp.argmin(part).astype(jnp.int32)
-    stops = crossed.any()
+    reason = jnp.argmin(part, axis=0).astype(jnp.int32)
+    stops = crossed.any(axis=0)
 
     # After the stop the bucket tilts to its end and the brake holds; the later of the two ends it.
     left_tilt = (machine.tilt_end - state.tilt) / jnp.maximum(tilt - state.tilt, 1e-9)
@@ -246,16 +307,16 @@ def _advance(
     give_up = (state.stop_time + 3.0 - state.time) / step
     left = jnp.minimum(jnp.maximum(left_tilt, left_brake), give_up)
     ends = (state.phase == _STOPPED) & (left <= 1.0)
-    fraction = jnp.where(filling, part.min(), jnp.where(ends, jnp.clip(left, 0.0, 1.0), 1.0))
+    fraction = jnp.where(filling, part.min(axis=0), jnp.where(ends, jnp.clip(left, 0.0, 1.0), 1.0))
     fraction = jnp.where(state.phase == _ENDED, 0.0, fraction)
 
-    mixed = jax.tree.map(
-        lambda old, new: (
-            old if jnp.issubdtype(old.dtype, jnp.integer) else old + fraction * (new - old)
-        ),
-        state,
-        trial,
-    )
+    # What the step does not change is the same array before and after.
+    def mix(old: Array, new: Array) -> Array:
+        if new is old:
+            return old
+        return old + fraction.reshape(*(1,) * (old.ndim - 1), -1) * (new - old)
+
+    mixed = jax.tree.map(mix, state, trial)
     # The bucket may be at its tilt end before the brake lets go.
     mixed = mixed.replace(tilt=jnp.minimum(mixed.tilt, machine.tilt_end))
     stop_x, stop_z = loader.bucket_tip(machine, mixed.position, mixed.boom, mixed.tilt)
@@ -268,7 +329,12 @@ def _advance(
     )
 
 
-_ALONG, _ = local_axes(STATE_CELLS, STATE_DISPLACEMENT)
+def _interpolated(profile: Float[Array, "n b"], x: Float[Array, " b"]) -> Float[Array, " b"]:
+    """Heights of profiles at positions along the heading; beyond its ends a profile is level."""
+    position = jnp.clip((x + STATE_DISPLACEMENT) / CELL_SIZE, 0.0, len(profile) - 1.0)
+    left = jnp.clip(jnp.floor(position), 0, len(profile) - 2).astype(jnp.int32)
+    here, ahead = (jnp.take_along_axis(profile, (left + k)[None], axis=0)[0] for k in (0, 1))
+    return here + (position - left) * (ahead - here)
 
 
 def dig(
@@ -291,37 +357,63 @@ def dig(
         soil: Soil parameters.
         settings: Time step, and whether reverse-mode derivatives must pass.
     """
-    width = jnp.asarray(terrain.lane_widths(machine), height.dtype)
-    profile = height @ (width / width.sum())
-    state = _initial(height, machine)
-
-    def advance(s: State) -> State:
-        return _advance(s, action, profile, ground, machine, soil, settings.step)
-
+    one = jax.tree.map(lambda part: jnp.asarray(part)[..., None], (height, ground, action))
     if settings.differentiable:
-        # Rematerialised in chunks: memory grows with the square root of the number of steps.
-        chunk = math.isqrt(settings.max_steps) + 1
-
-        @jax.checkpoint
-        def advance_chunk(s: State, _: None) -> tuple[State, None]:
-            return lax.scan(lambda c, _: (advance(c), None), s, None, length=chunk)[0], None
-
-        state, _ = lax.scan(advance_chunk, state, None, length=chunk)
+        cycles = _dig_recorded(one[0], one[1], one[2], machine, soil, settings)
     else:
-        state = lax.while_loop(lambda s: s.phase != _ENDED, advance, state)
+        cycles = _digger(machine, soil, settings)(one[0], one[1], one[2])
+    return jax.tree.map(lambda part: part[..., 0], cycles)
 
-    mass = state.fill.sum() * soil.density
-    time, drive, boom = loader.retreat(machine, state.position, state.boom, mass)
-    return Cycle(
-        mass=mass,
-        time=state.time + time,
-        work_drive=state.work_drive + drive,
-        work_boom=state.work_boom + boom,
-        work_bucket=state.work_bucket,
-        work_slip=state.work_slip,
-        fill_time=state.stop_time - state.dig_start,
-        stop_reason=state.stop_reason,
-        tip_x=state.stop_x,
-        tip_z=state.stop_z,
-        height=state.height,
-    )
+
+def _dig_recorded(
+    height: Array,
+    ground: Array,
+    action: Action,
+    machine: WheelLoader,
+    soil: Soil,
+    settings: Settings,
+) -> Cycle:
+    """Cycles side by side, in as many steps as any cycle may take, for reverse mode."""
+    # Rematerialised in chunks: memory grows with the square root of the number of steps.
+    chunk = math.isqrt(settings.max_steps) + 1
+
+    @jax.checkpoint
+    def advance_chunk(state: State, _: None) -> tuple[State, None]:
+        def step(s: State, _: None) -> tuple[State, None]:
+            return _step(s, machine, soil, settings.step), None
+
+        return lax.scan(step, state, None, length=chunk)[0], None
+
+    state = begin(height, ground, action, machine)
+    state, _ = lax.scan(advance_chunk, state, None, length=chunk)
+    return outcome(state, machine=machine, soil=soil)
+
+
+def _digger(
+    machine: WheelLoader, soil: Soil, settings: Settings
+) -> Callable[[Array, Array, Action], Cycle]:
+    """Plays cycles side by side; under `vmap` still side by side, the last axis of the arrays."""
+
+    @jax.custom_batching.custom_vmap
+    def play(height: Array, ground: Array, action: Action) -> Cycle:
+        state = begin(height, ground, action, machine)
+        steps = settings.max_steps
+        state = advance(state, machine=machine, soil=soil, settings=settings, steps=steps)
+        return outcome(state, machine=machine, soil=soil)
+
+    @play.def_vmap
+    def play_batch(
+        size: int, batched: Sequence[Any], height: Array, ground: Array, action: Action
+    ) -> tuple[Cycle, Cycle]:
+        def join(leaf: Array, is_batched: bool) -> Array:
+            leaf = leaf if is_batched else jnp.broadcast_to(leaf, (size, *leaf.shape))
+            return jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], -1)
+
+        cycles = play(*jax.tree.map(join, (height, ground, action), tuple(batched)))
+
+        def part(leaf: Array) -> Array:
+            return jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], size, -1), -2, 0)
+
+        return jax.tree.map(part, cycles), jax.tree.map(lambda _: True, cycles)
+
+    return play

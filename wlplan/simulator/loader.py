@@ -23,10 +23,10 @@ _SATURATION = 0.1
 
 def bucket_tip(
     machine: WheelLoader,
-    position: Float[Array, ""],
-    boom: Float[Array, ""],
-    tilt: Float[Array, ""],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    position: Float[Array, "*b"],
+    boom: Float[Array, "*b"],
+    tilt: Float[Array, "*b"],
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """Position of the cutting edge [m]. The linkage keeps the tilt while the boom moves."""
     forward, down = tip_arm(machine)
     pin_x = position - forward + machine.boom_length * (jnp.cos(boom) - math.cos(machine.boom_low))
@@ -45,10 +45,10 @@ def tip_arm(machine: WheelLoader) -> tuple[float, float]:
 
 def boom_force(
     machine: WheelLoader,
-    boom: Float[Array, ""],
-    vertical: Float[Array, ""],
-    horizontal: Float[Array, ""],
-) -> Float[Array, ""]:
+    boom: Float[Array, "*b"],
+    vertical: Float[Array, "*b"],
+    horizontal: Float[Array, "*b"],
+) -> Float[Array, "*b"]:
     """Force of the boom cylinders [N] from the virtual work of a small lift.
 
     The parallel linkage keeps the bucket's tilt, so only the loads' sums matter and not where on
@@ -68,11 +68,11 @@ def boom_force(
 
 def tilt_moment(
     machine: WheelLoader,
-    tilt: Float[Array, ""],
-    load: Float[Array, ""],
-    vertical: Float[Array, ""],
-    horizontal: Float[Array, ""],
-) -> Float[Array, ""]:
+    tilt: Float[Array, "*b"],
+    load: Float[Array, "*b"],
+    vertical: Float[Array, "*b"],
+    horizontal: Float[Array, "*b"],
+) -> Float[Array, "*b"]:
     """Moment that the bucket cylinder must overcome to tilt back [N m].
 
     Args:
@@ -94,14 +94,14 @@ def tilt_moment(
     )
 
 
-def actuator_speed(load: Float[Array, ""], stall: float) -> Float[Array, ""]:
+def actuator_speed(load: Float[Array, "*b"], stall: float) -> Float[Array, "*b"]:
     """Part of the commanded speed that an actuator reaches under load [1]."""
     return jnp.clip((stall - load) / (_SATURATION * stall), 0.0, 1.0)
 
 
 def drive(
-    machine: WheelLoader, speed: Float[Array, ""], vertical: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    machine: WheelLoader, speed: Float[Array, "*b"], vertical: Float[Array, "*b"]
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """Thrust of the wheels [N] and slip speed [m/s] towards the travel speed.
 
     Args:
@@ -123,10 +123,10 @@ def drive(
 
 def retreat(
     machine: WheelLoader,
-    position: Float[Array, ""],
-    boom: Float[Array, ""],
-    load_mass: Float[Array, ""],
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    position: Float[Array, "*b"],
+    boom: Float[Array, "*b"],
+    load_mass: Float[Array, "*b"],
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
     """The way back from standstill in the pile to the start, with the bucket tilted back.
 
     Args:

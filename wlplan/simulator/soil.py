@@ -15,8 +15,10 @@ sloped surface after Luengo, Singh and Cannon 1998).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -51,51 +53,108 @@ def earthmoving_force(
         external_friction: Friction between blade and soil [rad]; default: soil on steel.
         surcharge: Load on the surface [Pa].
     """
-    delta = soil.steel_friction if external_friction is None else external_friction
-    weight = soil.density * GRAVITY
-    cos_phi = math.cos(soil.friction)
-    # Everything that does not depend on the failure angle; the sines of sums follow from these.
-    locking = jnp.sin(delta + rake + soil.friction), jnp.cos(delta + rake + soil.friction)
-    lifting = jnp.sin(slope + soil.friction), jnp.cos(slope + soil.friction)
-    sticking = jnp.sin(rake + soil.friction), jnp.cos(rake + soil.friction)
-    sin_rake = jnp.sin(rake)
-    cot_rake = jnp.cos(rake) / sin_rake
-    load = weight * depth**2 / 2 + surcharge * depth
+    friction = soil.steel_friction if external_friction is None else external_friction
+    wedge = wedge_of(depth, rake, slope, friction, soil=soil, surcharge=surcharge)
+    return least_resistance(wedge, soil=soil)
 
-    def resistance(sin_beta: Array | float, cos_beta: Array | float) -> Array:
-        sin_eta = locking[0] * cos_beta + locking[1] * sin_beta
-        lift = lifting[0] * cos_beta + lifting[1] * sin_beta
-        cosine = sticking[1] * cos_beta - sticking[0] * sin_beta
-        force = load * (cot_rake + cos_beta / sin_beta) * lift
-        force = force + soil.cohesion * depth * cos_phi / sin_beta
-        force = force - soil.adhesion * depth * cosine / sin_rake
+
+class Wedge(NamedTuple):
+    """What the resistance of a wedge depends on, but for its failure angle."""
+
+    load: Float[Array, "*n"]  # gamma d^2 / 2 + q d [N/m]
+    depth: Float[Array, "*n"]  # [m]
+    cot_rake: Float[Array, "*n"]
+    # Sine and cosine: of slope + phi, of delta + rho + phi, and of rho + phi over sin rho.
+    lifting: tuple[Float[Array, "*n"], Float[Array, "*n"]]
+    locking: tuple[Float[Array, "*n"], Float[Array, "*n"]]
+    sticking: tuple[Float[Array, "*n"], Float[Array, "*n"]]
+
+
+def wedge_of(
+    depth: Float[Array, "*n"],
+    rake: Float[Array, "*n"],
+    slope: Float[Array, "*n"],
+    external_friction: Float[Array, "*n"] | float,
+    *,
+    soil: Soil,
+    surcharge: Float[Array, "*n"] | float = 0.0,
+) -> Wedge:
+    """The wedge that a blade pushes up; arguments as for `earthmoving_force`."""
+    sin_rake, beyond = jnp.sin(rake), rake + soil.friction
+    return Wedge(
+        load=soil.density * GRAVITY * depth**2 / 2 + surcharge * depth,
+        depth=depth,
+        cot_rake=jnp.cos(rake) / sin_rake,
+        lifting=(jnp.sin(slope + soil.friction), jnp.cos(slope + soil.friction)),
+        locking=(jnp.sin(external_friction + beyond), jnp.cos(external_friction + beyond)),
+        sticking=(jnp.sin(beyond) / sin_rake, jnp.cos(beyond) / sin_rake),
+    )
+
+
+def least_resistance(wedge: Wedge, *, soil: Soil) -> Float[Array, "*n"]:
+    """Force on the blade that pushes up a wedge, a metre of width [N/m]."""
+
+    def resistance(wedge: Wedge, sin_beta: Array, cos_beta: Array) -> Array:
+        sin_eta = wedge.locking[0] * cos_beta + wedge.locking[1] * sin_beta
+        lift = wedge.lifting[0] * cos_beta + wedge.lifting[1] * sin_beta
+        force = wedge.load * (wedge.cot_rake + cos_beta / sin_beta) * lift
+        # Left out where it is nothing: XLA may not drop a product with zero.
+        if soil.cohesion:
+            force = force + soil.cohesion * math.cos(soil.friction) * wedge.depth / sin_beta
+        if soil.adhesion:
+            cosine = wedge.sticking[1] * cos_beta - wedge.sticking[0] * sin_beta
+            force = force - soil.adhesion * wedge.depth * cosine
         # Beyond locking the wedge cannot be pushed out at all: no such angle may look cheap.
         beyond = jnp.maximum(_LOCKED - sin_eta, 0.0) / _LOCKED
         return force / jnp.maximum(sin_eta, _LOCKED) * (1.0 + beyond)
 
-    beta = lax.stop_gradient(_failure_angle(resistance))
-    return jnp.maximum(resistance(jnp.sin(beta), jnp.cos(beta)), 0.0)
+    sin_beta, cos_beta = lax.stop_gradient(_failure_angle(resistance, wedge))
+    return jnp.maximum(resistance(wedge, sin_beta, cos_beta), 0.0)
 
 
-def _failure_angle(resistance: Callable[[Array | float, Array | float], Array]) -> Array:
-    """The angle of least resistance; by the envelope theorem a constant for the derivative."""
-    values = [resistance(math.sin(b), math.cos(b)) for b in _FAILURE_ANGLES]
+def _failure_angle(
+    resistance: Callable[[Wedge, Array, Array], Array], wedge: Wedge
+) -> tuple[Array, Array]:
+    """Sine and cosine of the angle of least resistance.
+
+    By the envelope theorem the angle is a constant for the derivative.
+    """
+    like = wedge.load
+    # All trials are made at once, along a new leading axis.
+    wedge = jax.tree.map(lambda part: part[None], wedge)
+
+    def trials(values: Sequence[float]) -> Array:
+        return jnp.asarray(values, like.dtype).reshape(-1, *(1,) * like.ndim)
+
+    sines, cosines = ([f(b) for b in _FAILURE_ANGLES] for f in (math.sin, math.cos))
+    values = resistance(wedge, trials(sines), trials(cosines))
     before, here, after = values[0], values[1], values[2]
-    angle = jnp.full_like(here, _FAILURE_ANGLES[1])
-    for k in range(2, len(values) - 1):
+    sine, cosine = jnp.full_like(like, sines[1]), jnp.full_like(like, cosines[1])
+    for k in range(2, len(sines) - 1):
         better = values[k] < here
         before = jnp.where(better, values[k - 1], before)
         after = jnp.where(better, values[k + 1], after)
-        angle = jnp.where(better, _FAILURE_ANGLES[k], angle)
+        sine = jnp.where(better, sines[k], sine)
+        cosine = jnp.where(better, cosines[k], cosine)
         here = jnp.where(better, values[k], here)
-    angle = angle + _ANGLE_STEP * _vertex(before, here, after)
+    sine, cosine = _turned(sine, cosine, _ANGLE_STEP * _vertex(before, here, after))
     # Once more, closer up: the envelope theorem holds at the minimum and only there.
     for step in _CLOSER_STEPS:
-        sine, cosine, s, c = jnp.sin(angle), jnp.cos(angle), math.sin(step), math.cos(step)
-        before = resistance(sine * c - cosine * s, cosine * c + sine * s)
-        after = resistance(sine * c + cosine * s, cosine * c - sine * s)
-        angle = angle + step * _vertex(before, resistance(sine, cosine), after)
-    return angle
+        s = trials((-math.sin(step), 0.0, math.sin(step)))
+        c = trials((math.cos(step), 1.0, math.cos(step)))
+        values = resistance(
+            wedge, sine[None] * c + cosine[None] * s, cosine[None] * c - sine[None] * s
+        )
+        sine, cosine = _turned(sine, cosine, step * _vertex(*values))
+    return sine, cosine
+
+
+def _turned(sine: Array, cosine: Array, turn: Array) -> tuple[Array, Array]:
+    """Sine and cosine of an angle after a turn of at most 7 degrees, by series: exact to 1e-10."""
+    square = turn * turn
+    s = turn * (1.0 - square / 6.0 * (1.0 - square / 20.0))
+    c = 1.0 - square / 2.0 * (1.0 - square / 12.0 * (1.0 - square / 30.0))
+    return sine * c + cosine * s, cosine * c - sine * s
 
 
 def _vertex(before: Array, here: Array, after: Array) -> Array:

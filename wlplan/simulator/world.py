@@ -6,6 +6,7 @@ from typing import no_type_check
 
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float
 
 from wlplan.automaton import DEFAULT_SCHEDULE, Schedule, settle_dug, window_of
 from wlplan.heightmap import (
@@ -51,15 +52,7 @@ class Simulator(struct.PyTreeNode):
             The pile after, relaxed; the performance, whose work includes the wheels' slip; and
             the record of the cycle in SI units.
         """
-        window, start = window_of(pile, pose)
-        axes = (
-            jnp.asarray(a, pile.height.dtype) for a in local_axes(STATE_CELLS, STATE_DISPLACEMENT)
-        )
-        points = to_world(pose, *jnp.meshgrid(*axes, indexing="ij"))
-        floor = jnp.zeros_like(window.height) if window.ground is None else window.ground
-        level = sample(floor, window, pose.x, pose.y)
-        height = sample(window.height, window, *points) - level
-        ground = sample(floor, window, *points) - level
+        height, ground = self.view(pile, pose)
         cycle = dig(
             height,
             ground,
@@ -68,6 +61,37 @@ class Simulator(struct.PyTreeNode):
             soil=self.soil,
             settings=self.settings,
         )
+        return *self.leave(pile, pose, height, cycle), cycle
+
+    def view(self, pile: Pile, pose: Pose) -> tuple[Float[Array, "52 52"], Float[Array, "52 52"]]:
+        """Surface and floor in the local frame of a dig pose, over the floor there [m]."""
+        window, _ = window_of(pile, pose)
+        axes = (
+            jnp.asarray(a, pile.height.dtype) for a in local_axes(STATE_CELLS, STATE_DISPLACEMENT)
+        )
+        points = to_world(pose, *jnp.meshgrid(*axes, indexing="ij"))
+        if window.ground is None:
+            height = sample(window.height, window, *points)
+            return height, jnp.zeros_like(height)
+        level = sample(window.ground, window, pose.x, pose.y)
+        height = sample(window.height, window, *points) - level
+        return height, sample(window.ground, window, *points) - level
+
+    def leave(
+        self, pile: Pile, pose: Pose, height: Float[Array, "52 52"], cycle: Cycle
+    ) -> tuple[Pile, Performance]:
+        """Writes a loading back to its pile.
+
+        Args:
+            pile: Pile before.
+            pose: Dig location and heading.
+            height: Surface before in the local frame, see `view` [m].
+            cycle: Record of the loading.
+
+        Returns:
+            The pile after, relaxed, and the performance, as `play` does.
+        """
+        window, start = window_of(pile, pose)
         # What left the grid is the load: float rounding of the time stepping goes to the mass.
         change = cycle.height - height
         dug = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
@@ -82,4 +106,4 @@ class Simulator(struct.PyTreeNode):
         performance = Performance(
             mass=cycle.mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ
         )
-        return after, performance, cycle
+        return after, performance
