@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import platform
 from collections.abc import Callable
 from importlib import metadata
@@ -13,6 +12,7 @@ from typing import Any
 
 import jax
 
+from wlplan.compilation import cores
 from wlplan.io import write_text_atomic
 
 RESULTS = Path(__file__).parent / "results"
@@ -23,7 +23,7 @@ def conditions() -> dict[str, Any]:
     """Device and versions."""
     device = jax.devices()[0]
     return {
-        "device": f"{device.device_kind or device.platform}, {os.cpu_count()} cores",
+        "device": f"{device.device_kind or device.platform}, {cores()} cores",
         "machine": platform.machine(),
         "python": platform.python_version(),
         **{name: metadata.version(name) for name in ("wlplan", "jax", "jaxlib", "flax", "numpy")},

@@ -22,9 +22,9 @@ from wlplan.automaton import (
     sweeps,
     window_of,
 )
+from wlplan.bench.digs import random_digs
 from wlplan.excavation import excavate
 from wlplan.machine import WA320
-from wlplan.pile import SEED_PILES, seed_pile, toe_contour
 from wlplan.types import Pile, Pose
 
 REPOSE = math.radians(32.0)
@@ -129,54 +129,32 @@ def test_the_reference_comes_to_rest_at_the_angle_of_repose():
 
 @pytest.fixture(scope="module")
 def digs():
-    """A hundred random digs on all seed piles: windows before and after digging, and settled."""
-    rng = np.random.default_rng(0)
-    dig = jax.jit(lambda pile, pose, volume: _dig(pile, pose, volume))
-    piles = [
-        jax.jit(relax)(seed_pile(kind, slope=slope, seed=k))
-        for k, (kind, slope) in enumerate(SEED_PILES)
-    ]
-    found = []
-    for k in range(100):
-        pile = piles[k % len(piles)]
-        contour = toe_contour(pile)
-        point = rng.choice(np.flatnonzero(contour.accessible))
-        x, y = contour.points[point]
-        heading = contour.heading[point] + rng.uniform(-0.17, 0.17)
-        pose = Pose(*(jnp.float32(v) for v in (x, y, heading)))
-        before, dug, after, pile = dig(pile, pose, jnp.float32(rng.uniform(0.5, 3.0)))
-        piles[k % len(piles)] = pile
-        found.append((before, dug, after, pile))
-    return found
-
-
-def _dig(pile, pose, volume):
-    window, start = window_of(pile, pose)
-    dug, _ = excavate(window, pose, volume, width=WA320.bucket_width)
-    after = settle_dug(pile, dug.height, start)
-    return window, dug, window_of(after, pose)[0], after
+    """A hundred random digs on all seed piles, each pile as the digs before left it."""
+    return random_digs(100, seed=0)
 
 
 def test_after_a_load_no_slope_anywhere_is_more_than_a_degree_too_steep(digs):
     """Of the whole pile, not only of the window, load after load."""
-    steepest = [math.degrees(steepest_slope(pile)) for *_, pile in digs]
+    steepest = [math.degrees(steepest_slope(dig.after)) for dig in digs]
     assert max(steepest) <= 33.0 + 1e-3
 
 
 def test_a_load_leaves_the_volume_and_the_ground(digs):
     settled = jax.jit(settle)
-    for before, dug, _, pile in digs[::5]:
-        assert_volume_kept(dug.height, settled(dug).height)
-        assert pile.height.min() >= 0.0
-        assert dug.height.sum() < before.height.sum()
+    for dig in digs[::5]:
+        assert_volume_kept(dig.dug.height, settled(dig.dug).height)
+        hole = jax.lax.dynamic_update_slice(dig.pile.height, dig.dug.height, dig.start)
+        assert_volume_kept(hole, dig.after.height)
+        assert dig.after.height.min() >= 0.0
+        assert dig.dug.height.sum() < dig.before.height.sum()
 
 
 def test_settling_a_dig_is_close_to_the_converged_automaton(digs):
     """Within 2 cm on average over the disturbed area."""
     settled, reference = jax.jit(settle), jax.jit(converged)
-    for before, dug, *_ in digs[:: 100 // 12]:
-        fast, slow = settled(dug).height, reference(dug).height
-        changes = [jnp.abs(h - dug.height) for h in (before.height, fast, slow)]
+    for dig in digs[:: 100 // 12]:
+        fast, slow = settled(dig.dug).height, reference(dig.dug).height
+        changes = [jnp.abs(h - dig.dug.height) for h in (dig.before.height, fast, slow)]
         disturbed = jnp.max(jnp.stack(changes), axis=0) > 1e-3
         assert jnp.abs(fast - slow)[disturbed].mean() <= 0.02
 

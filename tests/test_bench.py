@@ -10,7 +10,7 @@ import pytest
 
 from wlplan import bench, cli
 from wlplan.automaton import converged, steepest_slope, sweeps
-from wlplan.bench import items
+from wlplan.bench import automata
 from wlplan.bench.baselines import (
     aeolis_rest,
     numba_sweeps,
@@ -19,7 +19,9 @@ from wlplan.bench.baselines import (
     steepest_rise,
 )
 from wlplan.bench.digs import random_digs
-from wlplan.bench.items import ITEMS, Item, Measured, Setup, measure_rollouts
+from wlplan.bench.items import ITEMS
+from wlplan.bench.rollouts import measure_rollouts
+from wlplan.bench.setup import Item, Measured, Setup
 from wlplan.bench.timing import Timing, compiled, timed
 from wlplan.errors import InputError
 from wlplan.pile import volume
@@ -30,14 +32,14 @@ DROP = 0.1 * math.tan(REPOSE)
 NUMBERS = {"cell_size": 0.1, "repose_angle": REPOSE, "tolerance": math.radians(1.0)}
 
 
-def rough(seed, shape=(17, 12)):
+def random_surface(seed, shape=(17, 12)):
     """A surface too steep almost everywhere, its border included."""
     return np.random.default_rng(seed).random(shape)
 
 
 def cliff(seed):
     """A block on uneven ground, 2 m high."""
-    height = 0.1 * rough(seed, (40, 33))
+    height = 0.1 * random_surface(seed, (40, 33))
     height[10:22, 12:20] += 2.0
     return height
 
@@ -55,7 +57,7 @@ def automaton(request):
 
 def test_a_baseline_is_the_automaton_sweep_by_sweep(automaton):
     with jax.enable_x64(True):
-        theirs = ours = rough(0)
+        theirs = ours = random_surface(0)
         for _ in range(40):
             theirs = automaton(theirs, DROP, 1)
             ours = np.asarray(sweeps(jnp.asarray(ours), DROP, None, 1))
@@ -65,7 +67,7 @@ def test_a_baseline_is_the_automaton_sweep_by_sweep(automaton):
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 def test_a_baseline_makes_as_many_sweeps_as_it_is_asked_for(automaton, count):
     with jax.enable_x64(True):
-        before = rough(1)
+        before = random_surface(1)
         kept = before.copy()
         found = automaton(before, DROP, count)
         expected = sweeps(jnp.asarray(before), DROP, None, count)
@@ -74,7 +76,7 @@ def test_a_baseline_makes_as_many_sweeps_as_it_is_asked_for(automaton, count):
 
 
 def test_a_baseline_works_in_the_precision_of_its_surface(automaton):
-    before = rough(2).astype(np.float32)
+    before = random_surface(2).astype(np.float32)
     found = automaton(before, DROP, 25)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, sweeps(jnp.asarray(before), DROP, None, 25), atol=1e-5)
@@ -91,14 +93,14 @@ def test_a_baseline_comes_to_rest_where_the_reference_does(automaton):
 
 
 def test_a_surface_at_rest_is_left_alone(automaton):
-    before = 0.01 * rough(4)
+    before = 0.01 * random_surface(4)
     found = rest(automaton, before, **NUMBERS)
     assert found.sweeps == 0
     np.testing.assert_array_equal(found.height, before)
 
 
 def test_the_steepest_rise_is_the_steepest_slope():
-    before = rough(5)
+    before = random_surface(5)
     slope = float(steepest_slope(Pile(jnp.asarray(before, jnp.float32), 0.1)))
     assert math.atan(steepest_rise(before) / 0.1) == pytest.approx(slope, rel=1e-6)
 
@@ -174,7 +176,7 @@ def test_compiling_gives_the_function_and_its_time():
 
 
 def test_the_names_offered_are_those_that_exist():
-    assert tuple(ITEMS) == cli.BENCH_ITEMS
+    assert tuple(ITEMS) == cli.benchmark.ITEMS
 
 
 def test_a_target_is_met_within_its_limits():
@@ -191,7 +193,7 @@ def test_a_target_is_met_within_its_limits():
 
 
 def test_an_item_that_needs_what_is_not_there_says_how_to_get_it(monkeypatch):
-    monkeypatch.setattr(items, "find_spec", lambda name: None)
+    monkeypatch.setattr(automata, "find_spec", lambda name: None)
     document = bench.run_bench(["numba", "aeolis"], quick=True)
     numba, aeolis = document["items"]
     assert "pip install wlplan[bench]" in numba["note"]
@@ -306,7 +308,7 @@ def test_everything_quickly(run):
     assert all(math.isfinite(number) for number in numbers(document))
     for record in document["items"]:
         check_record(record)
-        figures = set(record["figures"]) - set(cli._BENCH_FIGURES)
+        figures = set(record["figures"]) - set(cli.benchmark._FIGURES)
         assert not figures
     skipped = {record["name"] for record in document["items"] if record["run"] is None}
     assert skipped <= {"gpu-rollouts", "plan", "first-load", "numba", "aeolis"}

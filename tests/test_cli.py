@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from wlplan import cli, io, objective, planner, plots, report, worlds
+from wlplan import cli, dataset, io, objective, planner, plots, report, worlds
 from wlplan.diggability import edge_poses
 from wlplan.errors import InputError
 from wlplan.machine import GRAVEL
@@ -431,6 +431,18 @@ def test_a_folder_in_the_way_of_a_file_is_told(run, scan, tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["plan.png"]
 
 
+def test_a_place_for_data_that_cannot_be_written_is_refused_and_nothing_left(
+    run, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(dataset, "collect", lambda *_, **__: pytest.fail("has begun"))
+    (tmp_path / "file").write_text("mine")
+    refused(run("collect", "--out", tmp_path / "file"), "is a file")
+    refused(run("collect", "--out", tmp_path / "file" / "below" / "x.zarr"), "is a file")
+    if os.path.isdir("/proc/self"):
+        refused(run("collect", "--out", "/proc/out/x.zarr"), "cannot be written")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 # --- help, names, report
 
 
@@ -449,10 +461,10 @@ def test_no_command_shows_the_help(run):
 
 
 def test_the_names_offered_are_those_that_exist():
-    assert cli.WORLDS == worlds.WORLDS
-    assert cli.PLANNERS == planner.PLANNERS
-    assert tuple(objective.OBJECTIVES) == cli.OBJECTIVES
-    assert tuple(io._READERS) == cli._PILE_ENDINGS
+    assert cli.options.WORLDS == worlds.WORLDS
+    assert cli.options.PLANNERS == planner.PLANNERS
+    assert tuple(objective.OBJECTIVES) == cli.options.OBJECTIVES
+    assert tuple(io._READERS) == cli.inputs.PILE_ENDINGS
 
 
 class _Strict(HTMLParser):
@@ -488,10 +500,11 @@ def test_the_report_stands_alone_and_escapes_names(run, tmp_path):
 
 
 def test_compiling_inside_of_tracing_counts_once(monkeypatch):
-    watch = cli._Stopwatch()
+    watch = cli.progress.Stopwatch()
     with watch:
         now = time.perf_counter()
-        monkeypatch.setattr(cli, "_compilations", [(now, now + 2.0), (now + 1.0, now + 2.0)])
+        spans = [(now, now + 2.0), (now + 1.0, now + 2.0)]
+        monkeypatch.setattr(cli.progress, "_compilations", spans)
         watch._first = 0
     assert watch.compiling == pytest.approx(2.0)
 

@@ -248,9 +248,20 @@ def test_a_collection_that_was_cut_short_ends_with_the_same_bytes(store, tmp_pat
     assert contents(path) == contents(store)
 
 
+def test_missing_directories_above_are_made(tmp_path):
+    path = tmp_path / "not" / "yet" / "data.zarr"
+
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collect(path, cycles=CYCLES, seed=SEED, progress=stop)
+    assert [entry.name for entry in path.parent.iterdir()] == ["data.zarr"]
+
+
 @pytest.mark.parametrize("cores", [1, 3])
 def test_the_number_of_cores_does_not_show(store, tmp_path, monkeypatch, cores):
-    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    monkeypatch.setattr(module, "cores", lambda: cores)
     collect(tmp_path / "data.zarr", cycles=CYCLES, seed=SEED)
     assert contents(tmp_path / "data.zarr") == contents(store)
 
@@ -333,8 +344,8 @@ def test_other_things_are_not_overwritten(tmp_path):
     (tmp_path / "note.txt").write_text("keep me")
     refused(lambda: collect(tmp_path, cycles=3), "not a data set")
     refused(lambda: collect(tmp_path / "note.txt", cycles=3), "not a data set")
-    refused(lambda: collect(tmp_path / "missing" / "data.zarr", cycles=3), "No such file")
-    refused(lambda: collect(tmp_path / "data.zarr", cycles=0), "at least 1")
+    refused(lambda: collect(tmp_path / "note.txt" / "data.zarr", cycles=3), "cannot be written")
+    refused(lambda: collect(tmp_path / "missing" / "data.zarr", cycles=0), "at least 1")
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
     assert (tmp_path / "note.txt").read_text() == "keep me"
 

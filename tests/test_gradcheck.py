@@ -282,7 +282,7 @@ def test_json_holds_every_component_and_nothing_else(command, tmp_path):
 
 def test_the_command_and_the_module_agree():
     """The command repeats these to keep help fast."""
-    defaults = {option.name: option for option in cli.gradcheck.params}
+    defaults = {option.name: option for option in cli.wlplan.commands["gradcheck"].params}
     assert defaults["step"].default == gradcheck.STEP
     help_text = defaults["tolerance"].help.replace("e-0", "e-")
     for tolerance in (gradcheck.TOLERANCE, gradcheck.SIMULATOR_TOLERANCE):

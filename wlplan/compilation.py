@@ -50,13 +50,20 @@ class EachRow:
             with jax.enable_x64(double):
                 return jax.block_until_ready(self._one(shared, member))
 
-        results += _cores().map(run, members)
+        results += _threads().map(run, members)
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 @functools.cache
-def _cores() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count())
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(cores())
 
 
 def _kind(*arguments: Any) -> Any:

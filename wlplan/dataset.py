@@ -40,6 +40,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wlplan.automaton import relax
 from wlplan.characteristics import as_vector, characteristics
+from wlplan.compilation import cores
 from wlplan.errors import InputError
 from wlplan.heightmap import (
     PERFORMANCE_CELLS,
@@ -231,6 +232,7 @@ def collect(
 
     Args:
         path: Directory of the data set, a zarr (version 3) group; by custom it ends in `.zarr`.
+            Missing directories above it are made.
         cycles: Number of loading cycles; the last rollout is cut short to meet it.
         seed: Seed of piles, poses and actions.
         simulator: The simulator with its machine and soil.
@@ -248,6 +250,7 @@ def collect(
     layout = _Layout(cycles)
     done = 0
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)  # the lock goes there
         with _lock(path):
             wanted = _identity(cycles, seed, simulator)
             if _is_new(path):
@@ -293,7 +296,7 @@ def _batches(
 
     workers = [
         threading.Thread(target=work, name="collect", daemon=True)
-        for _ in range(min(os.cpu_count() or 1, len(numbers)))
+        for _ in range(min(cores(), len(numbers)))
     ]
     # Alone, so that the programs are compiled once.
     if numbers:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import os
 import platform
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,7 +10,9 @@ from typing import Any
 
 import jax
 
-from wlplan.bench.items import ITEMS, Item, Measured, Setup
+from wlplan.bench.items import ITEMS
+from wlplan.bench.setup import Item, Measured, Setup
+from wlplan.compilation import cores
 from wlplan.errors import InputError
 
 BENCH_FORMAT = "wlplan.bench/1"
@@ -89,7 +90,7 @@ def device() -> dict[str, Any]:
         "platform": accelerator.platform,
         "kind": accelerator.device_kind,
         "processor": _processor(),
-        "cores": _cores(),
+        "cores": cores(),
     }
 
 
@@ -101,13 +102,6 @@ def _processor() -> str:
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _versions() -> dict[str, str]:

@@ -22,13 +22,14 @@ _HEADING_SPREAD = math.radians(10.0)
 
 
 class Dig(NamedTuple):
-    """A pile with a load taken out of it, before anything slides."""
+    """A pile with a load taken out of it, before anything slides and after."""
 
     pile: Pile  # before, the whole grid
     pose: Pose
     before: Pile  # the window around the dig, before
     dug: Pile  # the window with the hole
     start: tuple[Array, Array]  # first cell of the window
+    after: Pile  # the whole grid once it has slid
 
 
 def relaxed_seed_piles(seed: int) -> list[Pile]:
@@ -72,9 +73,8 @@ def random_digs(count: int, seed: int) -> list[Dig]:
         pile = piles[k % len(piles)]
         pose = random_pose(pile, rng)
         volume = jnp.asarray(rng.uniform(_LEAST_VOLUME, _MOST_VOLUME), jnp.float32)
-        before, dug, start, after = _dig(pile, pose, volume)
-        digs.append(Dig(pile, pose, before, dug, start))
-        piles[k % len(piles)] = after
+        digs.append(Dig(pile, pose, *_dig(pile, pose, volume)))
+        piles[k % len(piles)] = digs[-1].after
     return digs
 
 

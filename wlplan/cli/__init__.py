@@ -1,0 +1,117 @@
+"""The command line: `wlplan plan`, `simulate`, `diggability`, `gradcheck`, `collect`, and so on.
+
+Results go to stdout, progress and remarks to stderr. Whatever is wrong with the input comes back as
+one line on stderr and exit code 2. What is slow to import is imported inside the commands, so that
+help and usage errors come at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+
+import click
+
+from wlplan.cli import benchmark, gradients, learning, maps, planning
+from wlplan.errors import InputError
+
+
+@click.group(
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(package_name="wlplan", message="%(prog)s %(version)s")
+@click.pass_context
+def wlplan(context: click.Context) -> None:
+    """Plan the bucket loads of a wheel loader from a scan of the pile.
+
+    PILE is a height map (.npz, GeoTIFF) or a point cloud (.las, .laz, .ply) in metres; without it,
+    or as the word `bundled`, the pile that ships with the package is used.
+    """
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
+
+
+for _command in (
+    *(planning.plan, planning.simulate, maps.diggability, gradients.gradcheck),
+    *(learning.collect, learning.train, learning.evaluate, benchmark.bench),
+):
+    wlplan.add_command(_command)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: Words after `wlplan`; by default those of the process.
+
+    Returns:
+        Exit code: 0 done, 1 a fault of ours, 2 bad input or usage, 130 interrupted.
+    """
+    if "_WLPLAN_COMPLETE" in os.environ:  # the shell asks for completions
+        wlplan.main(prog_name="wlplan")
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    with warnings.catch_warnings():
+        if not sys.warnoptions:
+            warnings.simplefilter("ignore")
+        _quieten()
+        try:
+            with wlplan.make_context("wlplan", words) as context:
+                wlplan.invoke(context)
+            sys.stdout.flush()
+            return 0
+        except click.exceptions.Exit as stop:
+            return stop.exit_code
+        except click.ClickException as error:
+            return _fail(_usage_message(error), 2)
+        except InputError as error:
+            return _fail(str(error), 2)
+        except (KeyboardInterrupt, click.Abort):
+            return _fail("interrupted: nothing half-written is left; run it again.", 130)
+        except BrokenPipeError:
+            # Whoever read our output has closed it: end quietly, also when Python flushes stdout.
+            with contextlib.suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        except MemoryError:
+            return _fail("out of memory: use a smaller pile, or fewer loads or locations.", 2)
+        except OSError as error:
+            place = f"{error.filename}: " if error.filename else ""
+            reason = error.strerror or str(error)
+            return _fail(f"{place}{reason}: check the path and the free space.", 2)
+        except Exception as error:
+            if os.environ.get("WLPLAN_DEBUG"):
+                traceback.print_exc()
+            return _fail(
+                f"this should not happen ({type(error).__name__}: {error}): please report it; "
+                f"WLPLAN_DEBUG=1 shows where.",
+                1,
+            )
+
+
+def _fail(message: str, code: int) -> int:
+    text = " ".join(message.split())
+    with contextlib.suppress(OSError, ValueError):
+        print(f"error: {text if len(text) <= 600 else text[:597] + '...'}", file=sys.stderr)
+    return code
+
+
+def _usage_message(error: click.ClickException) -> str:
+    message = error.format_message().rstrip(".")
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context is not None else "wlplan"
+    return f"{message}: see `{command} --help`."
+
+
+def _quieten() -> None:
+    """Keep libraries from writing to stderr, and let stdout take any character."""
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    logging.getLogger("jax._src.xla_bridge").setLevel(logging.ERROR)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, OSError, ValueError):
+            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]

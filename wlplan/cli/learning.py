@@ -1,0 +1,138 @@
+"""`wlplan collect`, `train` and `evaluate`: from the simulator to a learned model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wlplan.cli.inputs import check_is_folder, check_model
+from wlplan.cli.options import with_options
+from wlplan.cli.outputs import QUANTITIES, checked_folder, json_text, print_table, titled_table
+from wlplan.cli.progress import Progress, Stopwatch
+
+# A data set of so many takes 27 GB.
+_MOST_CYCLES = 1_000_000
+
+
+@click.command()
+@with_options(
+    click.option(
+        "--cycles",
+        type=click.IntRange(1, _MOST_CYCLES),
+        default=10_800,
+        show_default=True,
+        help="Number of loading cycles.",
+    ),
+    click.option("--out", metavar="DATA.zarr", required=True, help="Data set to write."),
+)
+def collect(cycles: int, out: str, seed: int, as_json: bool) -> None:
+    """Play random loading cycles in the simulator and store them as training data.
+
+    Interrupted, the same command goes on where it stopped.
+    """
+    checked_folder(out)
+
+    from wlplan.dataset import collect as collect_cycles
+
+    with Progress() as progress, Stopwatch() as playing:
+        collect_cycles(
+            out,
+            cycles=cycles,
+            seed=seed,
+            progress=lambda done, total: progress("cycles", done, total, None),
+        )
+    if as_json:
+        click.echo(json_text({"out": out, "cycles": cycles, "seed": seed}))
+        return
+    print(f"{cycles} cycles in {out}; {playing.text()}")
+
+
+@click.command()
+@click.argument("kind", metavar="MODEL", type=click.Choice(("psi-low",)))
+@with_options(
+    click.option("--data", metavar="DATA.zarr", required=True, help="Data set to train on."),
+    click.option("--out", metavar="DIR", required=True, help="Folder of the model."),
+    click.option(
+        "--epochs",
+        type=click.IntRange(1, 100_000),
+        default=300,
+        show_default=True,
+        help="Passes over the data.",
+    ),
+)
+def train(kind: str, data: str, out: str, epochs: int, seed: int, as_json: bool) -> None:
+    """Train MODEL (psi-low) on a data set and report its errors on cycles that it has not seen."""
+    check_is_folder(data, "data set", "wlplan collect")
+    checked_folder(out)
+
+    from wlplan.dataset import open_dataset
+    from wlplan.training import train_psi_low
+
+    dataset = open_dataset(data)
+    with Progress() as progress, Stopwatch() as training:
+        _, report = train_psi_low(
+            dataset,
+            out=out,
+            seed=seed,
+            epochs=epochs,
+            progress=lambda done, total: progress("epochs", done, total, None),
+        )
+    if as_json:
+        click.echo(json_text({"model": kind, "out": out, "held_out": report.as_dict()}))
+        return
+    _print_errors(f"{kind}, held-out part of {data}", report.as_dict())
+    print(f"training {training.text()}")
+    print(f"written: {out}")
+
+
+@click.command()
+@with_options(
+    click.option("--data", metavar="DATA.zarr", required=True, help="Data set to compare with."),
+    click.option(
+        "--model", metavar="DIR", default=None, help="Model; default: the one that ships."
+    ),
+)
+def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
+    """Report the errors of a model on simulated cycles.
+
+    Of the data set that it was trained on, only the part that was held out counts. The split
+    belongs to the model, so --seed changes nothing.
+    """
+    check_is_folder(data, "data set", "wlplan collect")
+    check_model(model, "low")
+
+    from wlplan.dataset import open_dataset
+    from wlplan.training import evaluate_psi_low, held_out, load_model, read_description
+    from wlplan.worlds import pretrained_path
+
+    folder = pretrained_path("psi_low") if model is None else Path(model)
+    description, predictor = read_description(folder), load_model(folder)
+    dataset = open_dataset(data)
+    part = held_out(dataset, description)
+    report = evaluate_psi_low(predictor, part).as_dict()
+    if as_json:
+        click.echo(json_text({"model": "psi-low", "data": data, "errors": report}))
+        return
+    which = "held-out part" if len(part) < len(dataset) else "all cycles"
+    _print_errors(f"psi-low, {which} of {data}", report)
+
+
+def _print_errors(title: str, report: Mapping[str, Any]) -> None:
+    table = titled_table(title)
+    for column in ("", "cycles", "mass", "time", "work"):
+        table.add_column(column, justify="left" if not column else "right")
+    kinds = (
+        ("mean_relative", "mean relative error", lambda v, unit: f"{100.0 * v:.2f} %"),
+        ("mean_absolute", "mean absolute error", lambda v, unit: f"{v:.3g} {unit}"),
+        ("total_relative", "error of the sum", lambda v, unit: f"{100.0 * v:+.2f} %"),
+    )
+    loaded = f"loads over {report['loaded_mass']:g} t"
+    for name, which in (("loaded", loaded), ("every", "all valid cycles")):
+        part = report[name]
+        for key, label, write in kinds:
+            cells = (write(part[key][q], unit) for q, (_, unit, _) in QUANTITIES.items())
+            table.add_row(f"{label}, {which}", str(part["cycles"]), *cells)
+    print_table(table)

@@ -1,0 +1,133 @@
+"""`wlplan diggability`: what one action would yield all around a pile."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import click
+
+from wlplan.cli.inputs import check_model, check_pile_name, pile_named, world_named
+from wlplan.cli.options import (
+    ActionNumbers,
+    model_option,
+    out_option,
+    pile_argument,
+    with_options,
+    world_option,
+)
+from wlplan.cli.outputs import (
+    QUANTITIES,
+    checked_folder,
+    json_text,
+    print_table,
+    titled_table,
+    write_files,
+)
+from wlplan.cli.progress import Progress, Stopwatch, ready
+
+_FORMAT = "wlplan.diggability/1"
+_MOST_LOCATIONS = 10_000
+
+
+@click.command()
+@pile_argument
+@with_options(
+    click.option(
+        "--locations",
+        type=click.IntRange(1, _MOST_LOCATIONS),
+        default=150,
+        show_default=True,
+        help="Number of dig locations around the pile.",
+    ),
+    click.option(
+        "--action",
+        type=ActionNumbers(),
+        default="0.68,4.51,0.17,4.46",
+        show_default=True,
+        help="Parameters of the bucket-filling controller, the same everywhere.",
+    ),
+    world_option,
+    model_option,
+    out_option,
+)
+def diggability(
+    pile_file: str,
+    locations: int,
+    action: tuple[float, ...],
+    world_name: str,
+    model: str | None,
+    out: str | None,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Map what one action would yield all around PILE.
+
+    With --out: diggability.png and diggability.json. Nothing is random, so --seed changes nothing.
+    """
+    check_pile_name(pile_file)
+    check_model(model, world_name)
+    folder = None if out is None else checked_folder(out)
+
+    import numpy as np
+
+    from wlplan.diggability import diggability_map
+    from wlplan.types import Action
+
+    pile, source = pile_named(pile_file)
+    world = world_named(world_name, model)
+    fixed = Action(*action)  # type: ignore[arg-type]
+    with Progress() as progress, Stopwatch() as mapping:
+        progress("diggability", 0, 1, None)
+        found = ready(diggability_map(world, pile, locations=locations, action=fixed))
+        progress("diggability", 1, 1, None)
+
+    records = {
+        name: np.asarray(getattr(part, name), np.float64)
+        for part in (found.pose, found.performance)
+        for name in (field.name for field in dataclasses.fields(part))
+    }
+    summary = {
+        q: {
+            "least": float(records[q].min()),
+            "median": float(np.median(records[q])),
+            "most": float(records[q].max()),
+        }
+        for q in QUANTITIES
+    }
+    names = [field.name for field in dataclasses.fields(Action)]
+    document = {
+        "format": _FORMAT,
+        "pile": source,
+        "world": world_name,
+        "action": dict(zip(names, action, strict=True)),
+        "summary": summary,
+        "locations": [
+            {name: float(values[n]) for name, values in records.items()} for n in range(locations)
+        ],
+    }
+    text = json_text(document)
+    if folder is not None:
+        from wlplan import plots
+
+        png = plots.png_bytes(plots.diggability_figure(pile, found))
+        write_files(folder, {"diggability.png": png, "diggability.json": f"{text}\n"})
+    if as_json:
+        click.echo(text)
+        return
+    table = titled_table(f"{locations} locations around {source['file']}, {world_name} world")
+    for column in ("", "least", "median", "most", "most at x [m]", "y [m]", "heading [°]"):
+        table.add_column(column, justify="left" if not column else "right")
+    for q, (title, unit, digits) in QUANTITIES.items():
+        best = int(records[q].argmax())
+        table.add_row(
+            f"{title} [{unit}]",
+            *(f"{value:.{digits}f}" for value in summary[q].values()),
+            f"{records['x'][best]:.2f}",
+            f"{records['y'][best]:.2f}",
+            f"{math.degrees(records['heading'][best]):.0f}",
+        )
+    print_table(table)
+    print(f"map {mapping.text()}")
+    if folder is not None:
+        print(f"written: {folder / 'diggability.png'}, and diggability.json beside it")

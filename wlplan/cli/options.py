@@ -1,0 +1,148 @@
+"""What the options of the commands have in common, their types and names included."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from wlplan.units import ACTION_HIGH, ACTION_LOW
+
+# Names that the modules behind define, repeated here to keep help fast; a test compares them.
+WORLDS = ("low", "high", "hybrid", "simulator")
+PLANNERS = ("gradient", "greedy", "nominal")
+OBJECTIVES = ("efficiency", "productivity", "energy")
+
+BUNDLED = "bundled"
+"""What stands for the pile that ships with the package where a file is asked for."""
+
+
+class Numbers(click.ParamType):
+    """Finite numbers with commas between them.
+
+    Args:
+        form: Names of the numbers, as help and complaints show them.
+        least: How many of them have to be given.
+    """
+
+    def __init__(self, form: str, least: int):
+        self.name = form
+        self._form = form
+        self._counts = range(least, form.count(",") + 2)
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """What stands for the value in the help."""
+        return self._form
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        """The numbers of a text; numbers themselves are let pass, as click asks for."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) not in self._counts or not all(math.isfinite(n) for n in numbers):
+            self.fail(f"{value!r} is not of the form {self._form}, with finite numbers", param, ctx)
+        return numbers
+
+
+class ActionNumbers(Numbers):
+    """The four parameters of the bucket-filling controller, inside their box."""
+
+    def __init__(self) -> None:
+        super().__init__("DELTA_BM,K_BM,DELTA_BK,K_BK", 4)
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        """The four parameters of a text."""
+        numbers = super().convert(value, param, ctx)
+        for name, number, low, high in zip(
+            self.name.lower().split(","), numbers, ACTION_LOW, ACTION_HIGH, strict=True
+        ):
+            if not low <= number <= high:
+                self.fail(
+                    f"{name} is {number:g}, outside its range {low:g} to {high:g}", param, ctx
+                )
+        return numbers
+
+
+def with_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A decorator: several click options at once, then those that every command has."""
+    common = (
+        click.option(
+            "--seed",
+            type=click.IntRange(0, 2**31 - 1),
+            default=0,
+            show_default=True,
+            help="Seed of everything random.",
+        ),
+        click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout."),
+    )
+
+    def decorate(command: Any) -> Any:
+        for option in reversed((*options, *common)):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+def loads_option(*, default: int, most: int, remark: str = "") -> Callable[[Any], Any]:
+    """The option that says how many loads there are.
+
+    Args:
+        default: Loads if the option is not given.
+        most: Most loads that may be asked for.
+        remark: Added to the help.
+    """
+    return click.option(
+        "--loads",
+        type=click.IntRange(1, most),
+        default=default,
+        show_default=True,
+        help=f"Number of bucket loads{remark}.",
+    )
+
+
+def objective_option(purpose: str) -> Callable[[Any], Any]:
+    """The option that says what a plan costs; `purpose` is its help."""
+    return click.option(
+        "--objective",
+        type=click.Choice(OBJECTIVES),
+        default=OBJECTIVES[0],
+        show_default=True,
+        help=purpose,
+    )
+
+
+pile_argument = click.argument("pile_file", metavar="[PILE]", default=BUNDLED)
+world_option = click.option(
+    "--world",
+    "world_name",
+    type=click.Choice(WORLDS),
+    default="low",
+    show_default=True,
+    help="What predicts: a learned world or the simulator.",
+)
+model_option = click.option(
+    "--model",
+    metavar="DIR",
+    default=None,
+    help="Model from `wlplan train` in place of the one that ships with the package.",
+)
+truck_option = click.option(
+    "--truck",
+    type=Numbers("X,Y[,HEADING_DEG]", 2),
+    default=None,
+    help="Where the loader stands when it dumps [m], in the frame of the scan, and which way it "
+    "then heads; without a heading the one with the shortest ways. Default: 12 m west of the pile.",
+)
+out_option = click.option(
+    "--out", metavar="DIR", default=None, help="Folder to write to; made if it is missing."
+)

@@ -1,0 +1,138 @@
+"""What the commands give out: folders written as a whole, JSON, tables and remarks."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import shutil
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from wlplan.errors import InputError
+
+QUANTITIES = {"mass": ("mass", "t", 2), "time": ("time", "s", 1), "work": ("work", "kJ", 0)}
+"""Quantity of a performance -> its title, its unit, and its digits after the point in tables."""
+
+
+def checked_folder(name: str) -> Path:
+    """A folder to write to, found out to be possible before anything long is begun.
+
+    Raises:
+        InputError: If it is a file, below one, or cannot be written.
+    """
+    if not name.strip():
+        raise InputError("the name of the folder to write to is empty: give one.")
+    if os.path.lexists(name) and not os.path.isdir(name):
+        raise InputError(f"{name}: is a file: name a folder to write to.")
+    folder = Path(name)
+    place = folder.absolute()
+    while not os.path.lexists(place):
+        place = place.parent
+    if not place.is_dir():
+        raise InputError(f"{name}: {place} is a file: name a folder to write to.")
+    probe = place / f".wlplan-{secrets.token_hex(6)}.tmp"
+    try:
+        probe.mkdir()
+        probe.rmdir()
+    except OSError as error:
+        raise InputError(
+            f"{name}: cannot be written ({error.strerror or error}): choose another folder."
+        ) from error
+    return folder
+
+
+@contextlib.contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """A hidden folder to write to, whose files move into place once all are there.
+
+    Other files in the folder stay. If writing fails or is interrupted, the folder is as it was.
+    """
+    exists = folder.is_dir()
+    if not exists:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    # Inside or beside the folder, so that moving is renaming on one file system.
+    name = f".{folder.name or 'wlplan'}.{secrets.token_hex(6)}.tmp"
+    staging = folder / name if exists else folder.with_name(name)
+    staging.mkdir()
+    try:
+        yield staging
+        files = sorted(staging.iterdir())
+        for file in files:
+            if (folder / file.name).is_dir():
+                raise InputError(
+                    f"{folder / file.name}: is a folder where a file goes: choose another --out."
+                )
+        if exists:
+            for file in files:
+                os.replace(file, folder / file.name)
+        else:
+            os.rename(staging, folder)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
+    """Write files into a folder, all or none.
+
+    Args:
+        folder: Folder, made if it is missing.
+        contents: Name of a file -> what it holds; text is written as UTF-8.
+
+    Raises:
+        InputError: If a file cannot be written.
+    """
+    from wlplan.io import write_bytes_atomic
+
+    with staged(folder) as staging:
+        for name, content in contents.items():
+            data = content.encode() if isinstance(content, str) else content
+            write_bytes_atomic(staging / name, data)
+
+
+def json_text(document: Mapping[str, Any]) -> str:
+    """A result as JSON, without a newline at the end.
+
+    Raises:
+        InputError: If a number is not finite, which JSON has no word for.
+    """
+    try:
+        return json.dumps(document, indent=2, allow_nan=False)
+    except ValueError as error:
+        raise InputError(
+            "the result holds numbers that are not finite: check the pile for spikes, or use "
+            "another world."
+        ) from error
+
+
+def remark(text: str) -> None:
+    """Tell on stderr what is worth knowing but no error."""
+    print(f"note: {text}", file=sys.stderr)
+
+
+def titled_table(title: str) -> Any:
+    """A table without columns yet, as `rich` has them, in the look of all commands."""
+    from rich import box
+    from rich.table import Table
+
+    return Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        collapse_padding=True,
+        pad_edge=False,
+    )
+
+
+def print_table(table: Any) -> None:
+    """Print a table on stdout."""
+    from rich.console import Console
+
+    # A file or a pipe has no width of its own: take what the table needs.
+    width = None if sys.stdout.isatty() else 140
+    # Units stand in square brackets, which would count as markup.
+    Console(width=width, highlight=False, markup=False).print(table)

@@ -1,0 +1,106 @@
+"""A plan that was played: its sums, its ledger, its table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from wlplan.cli.outputs import QUANTITIES, print_table, remark, titled_table
+
+if TYPE_CHECKING:
+    from wlplan.planner import PlanResult
+    from wlplan.types import Performance, Pile
+
+
+def _sum(values: Any) -> float:
+    import numpy as np
+
+    return float(np.asarray(values, np.float64).sum())
+
+
+def totals(performance: Performance, cost: Any = None) -> dict[str, float]:
+    """Sums of mass [tonne], time [s] and work [kJ] over the loads, and the cost if there is one."""
+    sums = {quantity: _sum(getattr(performance, quantity)) for quantity in QUANTITIES}
+    return sums if cost is None else {**sums, "cost": float(cost)}
+
+
+def transport_totals(result: PlanResult) -> dict[str, float]:
+    """Time [s] and work [kJ] of the ways of all loads."""
+    return {"time": _sum(result.transport_time), "work": _sum(result.transport_work)}
+
+
+def ledger_of(pile: Pile, simulated: PlanResult, simulator: Any) -> dict[str, float]:
+    """What left the pile [m^3], and what was loaded [tonne], at a density [tonne/m^3]."""
+    import numpy as np
+
+    from wlplan.pile import ground_height
+    from wlplan.units import KG_PER_TONNE
+
+    def volume(after: Pile) -> float:
+        # In float64: a bucket is a small difference of large volumes.
+        above = np.asarray(after.height, np.float64) - np.asarray(ground_height(after), np.float64)
+        return float(above.sum()) * after.cell_size**2
+
+    return {
+        "volume_before": volume(pile),
+        "volume_after": volume(simulated.rollout.pile),
+        "mass_removed": _sum(simulated.rollout.performance.mass),
+        "density": simulator.soil.density / KG_PER_TONNE,
+    }
+
+
+def remark_on_ledger(ledger: Mapping[str, float]) -> None:
+    """Tell if volume and mass of a ledger do not agree."""
+    from wlplan.report import LEDGER_TOLERANCE, ledger_error
+
+    error = ledger_error(ledger)
+    if error > LEDGER_TOLERANCE:
+        remark(f"the ledger of the simulated pile is off by {100.0 * error:.2g} %")
+
+
+def print_plan(document: Mapping[str, Any]) -> None:
+    """The loads of a plan as a table on stdout, with sums, cost and ledger."""
+    total, ledger = document["total"], document["ledger"]
+    predicted = total.get("predicted", {})
+    table = titled_table(f"{len(document['loads'])} loads from {document['pile']['file']}")
+    table.add_column("load")
+    # Short titles: all of it fits a terminal of 80 columns.
+    for title in ("x\n[m]", "y\n[m]", "head.\n[°]"):
+        table.add_column(title, justify="right")
+    for title, unit, _ in QUANTITIES.values():
+        if predicted:
+            table.add_column(f"{title}\npred.\n[{unit}]", justify="right", style="cyan")
+        table.add_column(f"{title}\nsim.\n[{unit}]", justify="right", style="yellow")
+    table.add_column("trans-\nport\n[s]", justify="right")
+
+    def cells(record: Mapping[str, Any], transport: Mapping[str, float]) -> list[str]:
+        row = []
+        for q, (_, _, digits) in QUANTITIES.items():
+            for part in ("predicted", "simulated") if predicted else ("simulated",):
+                row.append(f"{record[part][q]:.{digits}f}")
+        return [*row, f"{transport['time']:.1f}"]
+
+    for n, load in enumerate(document["loads"], start=1):
+        heading = round(math.degrees(load["heading"]))
+        place = (f"{load['x']:.2f}", f"{load['y']:.2f}", f"{heading}")
+        last = n == len(document["loads"])
+        table.add_row(str(n), *place, *cells(load, load["transport"]), end_section=last)
+    table.add_row("sum", "", "", "", *cells(total, total["transport"]), style="bold")
+    print_table(table)
+
+    for q, (title, unit, _) in QUANTITIES.items():
+        simulated = total["simulated"][q]
+        if predicted and simulated:
+            off = 100.0 * (predicted[q] / simulated - 1.0)
+            print(
+                f"{title}: predicted {predicted[q]:.1f} {unit}, simulated {simulated:.1f} {unit}, "
+                f"difference {off:+.1f} %"
+            )
+    costs = [f"{part} {total[part]['cost']:.3f}" for part in total if "cost" in total[part]]
+    print(f"cost for {document['objective']}: {', '.join(costs)}")
+    lost = ledger["volume_before"] - ledger["volume_after"]
+    print(
+        f"ledger: {ledger['volume_before']:.2f} m³ before, {ledger['volume_after']:.2f} m³ after; "
+        f"{lost:.3f} m³ at {ledger['density']:.3f} t/m³ for {ledger['mass_removed']:.3f} t loaded"
+    )
