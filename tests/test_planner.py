@@ -12,10 +12,10 @@ from laws import assert_gradient
 import wlplan
 from wlplan.errors import InputError
 from wlplan.excavation import excavate
-from wlplan.pile import ToeContour
+from wlplan.pile import ToeContour, toe_contour
 from wlplan.planner import GradientSettings, SearchSettings, plan_loads, play
 from wlplan.planner.job import squash, unsquash
-from wlplan.planner.toe import TOE_RISE, Toe, distance_to_toe, pose_at, toe_of
+from wlplan.planner.toe import TOE_RISE, distance_to_toe, pose_at, toe_of
 from wlplan.types import Action, Performance, Pile, Pose, action_vector
 
 BEST_ACTION = np.array([0.3, 2.0, 0.5, 3.5])
@@ -103,14 +103,30 @@ def test_only_accessible_points_are_dug():
     accessible[50:120] = accessible[200:220] = False
     toe = toe_of(dataclasses.replace(contour, accessible=accessible))
     assert not toe.closed
-    assert toe.points.shape[0] == accessible.sum()
+    assert int(toe.count) == accessible.sum()
     # Beyond the longest gap is where the path begins.
     np.testing.assert_allclose(toe.points[0], contour.points[120], atol=1e-6)
-    reach = Toe(points=toe.points, direction=toe.direction, closed=False)
     for position in np.linspace(-0.2, 1.2, 60):
-        pose = pose_at(reach, cone(), jnp.asarray(position), jnp.asarray(0.0))
+        pose = pose_at(toe, cone(), jnp.asarray(position), jnp.asarray(0.0))
         turn = (math.atan2(pose.y, pose.x) / (2 * np.pi) % 1.0) * 290
         assert accessible[round(turn) % 290] or accessible[round(turn - 0.6) % 290]
+
+
+def test_another_pile_on_the_same_grid_needs_no_compiling(caplog):
+    """The next action has to come within a second, on a pile whose toe the last load changed."""
+    first, second = cone(), cone(radius=3.0)
+    lengths = [toe_contour(pile).length for pile in (first, second)]
+    assert abs(lengths[0] - lengths[1]) > 3.0
+
+    def compilations(pile):
+        caplog.clear()
+        with jax.log_compiles():
+            plan_loads(bowl_world, pile, loads=1, planner="greedy", settings=SEARCH)
+        return [r.getMessage() for r in caplog.records if "XLA compilation" in r.getMessage()]
+
+    jax.clear_caches()
+    assert compilations(first)
+    assert not compilations(second)
 
 
 @pytest.mark.parametrize("planner", ["greedy", "nominal"])

@@ -241,9 +241,12 @@ def test_saving_replaces_a_model_and_nothing_else(copy, saved, tmp_path):
     (other / "thesis.txt").write_text("keep me")
     refused(lambda: save_model(other, saved[1], {}), "not a model")
     refused(lambda: save_model(other / "thesis.txt", saved[1], {}), "is a file")
-    refused(lambda: save_model(tmp_path / "missing" / "model", saved[1], {}), "folder")
+    (tmp_path / "file").write_text("")
+    refused(lambda: save_model(tmp_path / "file" / "model", saved[1], {}), "is a file")
+    save_model(tmp_path / "missing" / "folder" / "model", saved[1], {})
+    load_model(tmp_path / "missing" / "folder" / "model")
     assert (other / "thesis.txt").read_text() == "keep me"
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["copy", "other"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["copy", "file", "missing", "other"]
 
 
 def test_a_failed_save_leaves_the_old_model(copy, saved, monkeypatch):
@@ -261,7 +264,8 @@ def test_a_failed_save_leaves_the_old_model(copy, saved, monkeypatch):
 def test_a_bad_place_is_refused_before_the_training(data, tmp_path):
     done = []
     call = {**LIGHT, "progress": lambda *n: done.append(n)}
-    refused(lambda: train_psi_low(data, out=tmp_path / "a" / "b", **call), "folder")
+    (tmp_path / "file").write_text("")
+    refused(lambda: train_psi_low(data, out=tmp_path / "file" / "b", **call), "is a file")
     assert not done
 
 

@@ -51,7 +51,8 @@ class EachRow:
                 return jax.block_until_ready(self._one(shared, member))
 
         results += _threads().map(run, members)
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
+        # By numpy: another number of rows would be compiled anew.
+        return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *results)
 
 
 def cores() -> int:

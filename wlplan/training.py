@@ -336,7 +336,7 @@ def save_model(
     old = directory.with_name(f".{directory.name}.{token}.old")
     try:
         try:
-            beside.mkdir()
+            beside.mkdir(parents=True)
             with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
                 checkpointer.save(beside / _WEIGHTS, args=ocp.args.PyTreeSave(weights))
             # Names the directory it was made in, and nothing reads it on a file system that
@@ -450,8 +450,11 @@ def read_description(directory: str | os.PathLike[str]) -> dict[str, Any]:
 
 def _check_target(directory: Path) -> None:
     """Refuses to replace anything but a model."""
-    if not directory.absolute().parent.is_dir():
-        raise InputError(f"{directory}: its folder does not exist: make it, or choose another.")
+    place = directory.absolute().parent
+    while not os.path.lexists(place):
+        place = place.parent
+    if not place.is_dir():
+        raise InputError(f"{directory}: {place} is a file: name a directory for the model.")
     if not os.path.lexists(directory):
         return
     if not directory.is_dir():

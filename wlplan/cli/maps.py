@@ -100,6 +100,7 @@ def diggability(
         "format": _FORMAT,
         "pile": source,
         "world": world_name,
+        **({} if model is None else {"model": model}),
         "action": dict(zip(names, action, strict=True)),
         "summary": summary,
         "locations": [

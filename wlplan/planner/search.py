@@ -16,6 +16,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from wlplan.compilation import EachRow
 from wlplan.planner.job import (
     Decisions,
     ToeJob,
@@ -58,16 +59,39 @@ def _spread_actions(n: int, rng: np.random.Generator, dtype: np.dtype) -> Float[
     return jnp.asarray(unsquash(latin_hypercube(n, 4, rng)), dtype)
 
 
-@functools.partial(jax.jit, static_argnames="batch")
-def _candidate_costs(
-    job: ToeJob, pile: Pile, poses: Decisions, actions: Float[Array, "a 4"], *, batch: int
+def _costs_at_poses(
+    shared: tuple[ToeJob, Pile, Float[Array, "a 4"]], poses: Float[Array, "p 2"]
 ) -> Float[Array, "p a"]:
     """Cost of every action at every pose; what depends on the pose alone is computed once."""
+    job, pile, actions = shared
 
-    def at_pose(pose: Decisions) -> Array:
-        return jax.vmap(lambda action: cost_of_one(job, pile, pose.replace(action=action)))(actions)
+    def at_pose(pose: Array) -> Array:
+        return jax.vmap(lambda a: cost_of_one(job, pile, Decisions(pose[0], pose[1], a)))(actions)
 
-    return jax.lax.map(at_pose, poses, batch_size=max(1, batch // actions.shape[0]))
+    return jax.vmap(at_pose)(poses)
+
+
+_costs_of_portions = EachRow(_costs_at_poses)
+
+
+def _candidate_costs(
+    job: ToeJob,
+    pile: Pile,
+    poses: Float[np.ndarray, "p 2"],
+    actions: Float[Array, "a 4"],
+    *,
+    batch: int,
+) -> Float[np.ndarray, "p a"]:
+    """Cost of every action at every pose, in portions of at most `batch` of one shape.
+
+    Poses are positions along the toe and heading offsets, as in `Decisions`. Their number follows
+    from the length of the toe; if that were a shape, every next pile would be compiled for.
+    """
+    size = max(1, batch // len(actions))
+    portions = -(-len(poses) // size)
+    rows = np.minimum(np.arange(portions * size), len(poses) - 1).reshape(portions, size)
+    costs = _costs_of_portions((job, pile, actions), poses[rows])
+    return np.asarray(costs).reshape(-1, len(actions))[: len(poses)]
 
 
 @functools.partial(jax.jit, static_argnames=("steps", "rate"))
@@ -132,19 +156,15 @@ def greedy(
     for load in range(loads):
         # A fresh shift a loading, so that poses are not tied to one raster.
         positions = (np.arange(count) + rng.random()) / count
-        grid = np.stack(np.meshgrid(positions, settings.offsets, indexing="ij"), -1).reshape(-1, 2)
+        poses = np.stack(np.meshgrid(positions, settings.offsets, indexing="ij"), -1)
+        poses = poses.reshape(-1, 2).astype(dtype)
         actions = _spread_actions(settings.actions, rng, dtype)
-        poses = Decisions(
-            position=jnp.asarray(grid[:, 0], dtype),
-            offset=jnp.asarray(grid[:, 1], dtype),
-            action=jnp.zeros((len(grid), 4), dtype),
-        )
-        costs = np.asarray(_candidate_costs(job, pile, poses, actions, batch=settings.batch))
+        costs = _candidate_costs(job, pile, poses, actions, batch=settings.batch)
         # One start a pose, so that refinement does not begin in the same place eight times.
         best_poses = np.argsort(costs.min(axis=1))[: settings.refined]
         starts = Decisions(
-            position=poses.position[best_poses],
-            offset=poses.offset[best_poses],
+            position=jnp.asarray(poses[best_poses, 0]),
+            offset=jnp.asarray(poses[best_poses, 1]),
             action=actions[costs.argmin(axis=1)[best_poses]],
         )
         values = costs.min(axis=1)[best_poses]

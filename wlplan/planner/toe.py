@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from wlplan.heightmap import sample, to_world
 from wlplan.pile import ToeContour
@@ -30,17 +30,24 @@ TOE_RISE = 0.15
 _FROM, _TO, _STEP = -2.0, 9.0, 0.1
 # Neighbouring points further apart than this are not neighbours on the contour [m].
 _GAP = 0.5
+# Points of a toe come in multiples of so many.
+_BLOCK = 1024
 # The toe is where the mean over these lines across the bucket rises [m].
 _ACROSS = (-0.9, -0.45, 0.0, 0.45, 0.9)
 
 
 @no_type_check
 class Toe(struct.PyTreeNode):
-    """A toe contour as arrays, for use inside jitted functions."""
+    """A toe contour as arrays, for use inside jitted functions.
+
+    The last point is repeated until there is a multiple of 1,024: so what is compiled for one pile
+    serves the next, whose toe has another length.
+    """
 
     points: Float[Array, "n 2"]  # [m]
     direction: Float[Array, "n 2"]  # unit vector into the pile
-    closed: bool = struct.field(pytree_node=False)
+    count: Int[Array, ""]  # points without the repeated ones
+    closed: Bool[Array, ""]
 
 
 def toe_of(contour: ToeContour, dtype: np.dtype | type = np.float32) -> Toe:
@@ -60,10 +67,14 @@ def toe_of(contour: ToeContour, dtype: np.dtype | type = np.float32) -> Toe:
         order = np.roll(np.arange(len(points)), -first)
         points, heading, accessible = points[order], heading[order], accessible[order]
     points, heading = points[accessible], heading[accessible]
+    count = len(points)
+    rows = np.minimum(np.arange(-(-count // _BLOCK) * _BLOCK), count - 1)
+    points, heading = points[rows], heading[rows]
     return Toe(
         points=jnp.asarray(points, dtype),
         direction=jnp.asarray(np.stack([np.cos(heading), np.sin(heading)], axis=1), dtype),
-        closed=closed,
+        count=jnp.asarray(count, jnp.int32),
+        closed=jnp.asarray(closed),
     )
 
 
@@ -76,13 +87,14 @@ def pose_at(toe: Toe, pile: Pile, position: Float[Array, ""], offset: Float[Arra
         position: Along the contour, in parts of its length; wraps around a closed contour.
         offset: Heading offset, unbounded; squashed to `MAX_OFFSET`.
     """
-    n = toe.points.shape[0]
-    if toe.closed:
-        index = (position - jnp.floor(position)) * n
-    else:
-        index = jnp.clip(position, 0.0, 1.0) * (n - 1)
+    n = toe.count
+    index = jnp.where(
+        toe.closed,
+        (position - jnp.floor(position)) * n,
+        jnp.clip(position, 0.0, 1.0) * (n - 1),
+    )
     low = jnp.clip(jnp.floor(lax.stop_gradient(index)).astype(jnp.int32), 0, n - 1)
-    high = (low + 1) % n if toe.closed else jnp.minimum(low + 1, n - 1)
+    high = jnp.where(toe.closed, (low + 1) % n, jnp.minimum(low + 1, n - 1))
     # Across a gap in the contour there is nothing to interpolate.
     gap = jnp.abs(toe.points[high] - toe.points[low]).max() > _GAP
     part = jnp.where(gap, jnp.round(index - low), index - low)
