@@ -1,4 +1,4 @@
-"""Running several rollouts side by side.
+"""What XLA has to be helped with: several rollouts side by side, and results that are kept.
 
 A CPU gains nothing from a batch of rollouts, which only takes longer to compile and waits for its
 slowest member; but each of its cores can run one.
@@ -15,6 +15,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from wlplan.types import PyTree
 
 
 class EachRow:
@@ -53,6 +57,38 @@ class EachRow:
         results += _threads().map(run, members)
         # By numpy: another number of rows would be compiled anew.
         return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *results)
+
+
+def stored(values: PyTree, wanted: Bool[Array, ""], *, otherwise: float = 0.0) -> PyTree:
+    """Arrays as they are, or filled with a number where they are not wanted.
+
+    On a CPU XLA computes an array anew in each operation that uses it, and for each element of a
+    larger array that it is part of. A branch makes it store the array. On other devices, where a
+    branch costs more than it saves, nothing is done.
+
+    Args:
+        values: Pytree of arrays.
+        wanted: Must not be known when compiling.
+        otherwise: The number.
+    """
+    if jax.default_backend() != "cpu":
+        return values
+
+    def unwanted(values: PyTree) -> PyTree:
+        return jax.tree.map(lambda leaf: jnp.full_like(leaf, otherwise), values)
+
+    return lax.cond(wanted, lambda values: values, unwanted, values)
+
+
+def kept(values: PyTree, source: Float[Array, ""]) -> PyTree:
+    """`stored` for arrays that are wanted unless a number they come from is NaN; then so are they.
+
+    Args:
+        values: Pytree of arrays.
+        source: For instance one of the heights; not of a single member of a batch, since a branch
+            that differs among members is no branch.
+    """
+    return stored(values, source == source, otherwise=float("nan"))
 
 
 def cores() -> int:

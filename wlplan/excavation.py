@@ -15,10 +15,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from wlplan.heightmap import cell_centres, take, to_local
 from wlplan.types import Pile, Pose
+
+PENETRATION = "penetration"
+"""Name of the result that takes long to find and a number to keep, for `jax.checkpoint`."""
 
 # How steeply the cut rises behind the penetration. Estimate: buckets leave the floor and curl up
 # about so; the automaton evens out the rest.
@@ -111,6 +115,7 @@ def excavate(
     penetration = lax.fori_loop(
         0, _NEWTON_STEPS, lambda _, p: newton(p, frozen, goal), (low + high) / 2
     )
+    penetration = checkpoint_name(penetration, PENETRATION)
     penetration = newton(penetration, strip, wanted)
     # What rounding leaves over is met by scaling the cut.
     removed = take(cut(penetration, strip), strip.weight * strip.above, wanted)

@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from wlplan.compilation import kept
 from wlplan.types import LocalHeightmap, Pile, Pose
 from wlplan.units import CELL_SIZE
 
@@ -87,7 +88,7 @@ def sample_local(
     """
     along, left = (jnp.asarray(a, pile.height.dtype) for a in local_axes(cells, displacement))
     along, left = jnp.meshgrid(along, left, indexing="ij")
-    height = sample(pile.height, pile, *to_world(pose, along, left))
+    height = kept(sample(pile.height, pile, *to_world(pose, along, left)), pile.height[0, 0])
     first = sample(pile.height, pile, *to_world(pose, jnp.asarray(-displacement), jnp.asarray(0.0)))
     return LocalHeightmap(height - first, CELL_SIZE, displacement)
 
@@ -156,10 +157,21 @@ def take(
         return jnp.clip(scale + step, 0.0, _LARGEST_SCALE), follows
 
     frozen = lax.stop_gradient((wanted, available, total))
-    scale = lax.fori_loop(0, 4, lambda _, s: newton(s, *frozen)[0], jnp.ones_like(frozen[2]))
+
+    def unsettled(state: tuple[Array, Array, Array]) -> Array:
+        before, scale, steps = state
+        return (scale != before) & (steps < _MOST_STEPS)
+
+    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        _, scale, steps = state
+        return scale, newton(scale, *frozen)[0], steps + 1
+
+    one = jnp.ones_like(frozen[2])
+    _, scale, _ = lax.while_loop(unsettled, step, (0.0 * one, one, jnp.zeros((), jnp.int32)))
     scale, follows = newton(scale, wanted, available, total)
     return jnp.minimum(jnp.where(follows, scale * wanted, available), available)
 
 
+_MOST_STEPS = 4
 # Where nothing is left to take, the scale would grow without bound.
 _LARGEST_SCALE = 1e3

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 from jax import lax
 
+from wlplan.excavation import PENETRATION
 from wlplan.types import Action, LoadingPlan, Pile, Pose, PyTree, Rollout, World
 
 
@@ -46,7 +48,7 @@ def closed_loop(
         The outcome and the plan that led to it.
     """
 
-    @jax.checkpoint
+    @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(PENETRATION))
     def load(pile: Pile, inputs_n: PyTree):
         pose, action = decide(pile, inputs_n)
         pile, performance = world(pile, pose, action)

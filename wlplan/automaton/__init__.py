@@ -23,10 +23,10 @@ of our own. Forward mode is not available (JAX says so), and the floor and the a
 count as constants.
 """
 
+from wlplan.automaton.flow import FLOW_FRACTION, converged, sweep, sweeps
+from wlplan.automaton.relaxation import relax, settle, settle_dug
 from wlplan.automaton.rounds import DEFAULT_SCHEDULE, Schedule
-from wlplan.automaton.settle import relax, settle, settle_dug
 from wlplan.automaton.slopes import movable, steepest_slope
-from wlplan.automaton.sweeps import FLOW_FRACTION, converged, sweep, sweeps
 from wlplan.automaton.windows import WINDOW, pad_pile, window_of
 
 __all__ = [

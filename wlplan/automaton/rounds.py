@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from wlplan.automaton.flow import slide
 from wlplan.automaton.neighbours import links_of
-from wlplan.automaton.sweeps import slide
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Schedule:
     The defaults are the quickest that were found for bucket loads, see docs/automaton.md.
     """
 
-    sweeps: tuple[int, ...] = (6, 8, 10)
+    sweeps: tuple[int, ...] = (6, 8, 12)
     # Part of the velocity that is kept from sweep to sweep.
-    momentum: float = 0.9
+    momentum: float = 0.95
     # How much steeper than the angle of repose the result may be [rad].
     tolerance: float = math.radians(1.0)
     # It gives up after this many rounds. Bucket loads take about four; 67 were seen on a slope

@@ -3,35 +3,41 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
-from wlplan.bench.digs import random_pose
-from wlplan.bench.setup import Item, Measured, Setup, random_actions, stacked
-from wlplan.bench.timing import compiled, timed
+from wlplan.bench.setup import Item, Measured, Setup
+from wlplan.bench.timing import Timing, timed
+from wlplan.dataset import collect
 from wlplan.planner import plan_loads
-from wlplan.types import Pile, action_from
+from wlplan.types import Pile
 from wlplan.worlds import load_world
 
-_CYCLES, _GROUPS = 64, 4  # simulated at once, and in how many calls that are under way together
+_CYCLES, _FEW_CYCLES = 3_600, 180  # that are collected, and when it has to be quick
 _PLANNED = 15  # loads of a plan
 
 
 def _measure_cycles(setup: Setup) -> Measured:
-    rng = np.random.default_rng(setup.seed)
-    actions = random_actions(_CYCLES, rng)
-    cycles = []
-    for k in range(_CYCLES):
-        pile = setup.piles[k % len(setup.piles)]
-        cycles.append((pile, random_pose(pile, rng), action_from(actions[k])))
-    groups = [stacked(cycles[k::_GROUPS]) for k in range(_GROUPS)]
-    run, seconds = compiled(jax.vmap(load_world("simulator")), *groups[0])
-    (found,) = setup.timed([lambda: [run(*group) for group in groups]], [()])
-    return Measured(seconds, found.timing, {"cycles_per_second": _CYCLES / found.timing.median})
+    cycles = _FEW_CYCLES if setup.quick else _CYCLES
+    with tempfile.TemporaryDirectory() as folder:
+
+        def play(count: int) -> float:
+            path = Path(folder) / f"{count}.zarr"
+            start = time.perf_counter()
+            collect(path, cycles=count, seed=setup.seed)
+            seconds = time.perf_counter() - start
+            shutil.rmtree(path)
+            return seconds
+
+        # One cycle is next to nothing beside the compiling.
+        compiling, running = play(1), play(cycles)
+    return Measured(compiling, Timing.of([running]), {"cycles_per_second": cycles / running})
 
 
 def _cold_and_warm(plan: Callable[[], Any], seconds: float) -> Measured:
@@ -59,7 +65,7 @@ def _measure_first_load(setup: Setup) -> Measured:
         return plan_loads(setup.world, pile, loads=1, planner="greedy", seed=setup.seed).cost
 
     measured = _cold_and_warm(lambda: first(setup.cone), 5.0)
-    # The toe of another pile has another length, for which the planner is compiled anew.
+    # The toe of another pile has another length, which must not matter.
     start = time.perf_counter()
     jax.block_until_ready(first(setup.piles[0]))
     return dataclasses.replace(
@@ -70,7 +76,7 @@ def _measure_first_load(setup: Setup) -> Measured:
 PLANNING = (
     Item(
         "cycles",
-        f"{_CYCLES} simulated cycles, {_GROUPS} calls under way",
+        f"{_CYCLES:,} simulated cycles, collected and stored",
         _measure_cycles,
         "simulator",
         "paper 0.1 a second, prototype 185",
@@ -89,12 +95,12 @@ PLANNING = (
     ),
     Item(
         "first-load",
-        "the first load, again, by a warm greedy planner",
+        "the next load, by a warm greedy planner",
         _measure_first_load,
         "planner",
         "follow-up 43 s",
-        "≤ 1 s",
-        most={"run": 1.0},
+        "≤ 1 s, on any pile",
+        most={"run": 1.0, "seconds_on_another_pile": 1.0},
         long=True,
     ),
 )

@@ -74,12 +74,12 @@ def _print_bench(document: Mapping[str, Any]) -> None:
     table = titled_table(
         f"{device['processor']}, {device['cores']} cores; JAX {versions['jax']} on {device['kind']}"
     )
-    table.add_column("item", min_width=28)
+    table.add_column("item", width=34)
     for column in ("compile", "run,\nmedian", "10th to 90th\npercentile", "runs"):
-        table.add_column(column, justify="right")
-    table.add_column("found", min_width=20)
-    for column in ("to reach", "met", "others"):
-        table.add_column(column)
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("found", width=32)
+    table.add_column("to reach", width=20)
+    table.add_column("met", width=3)
     records = document["items"]
     for record, after in zip(records, (*records[1:], None), strict=True):
         run = record["run"]
@@ -89,13 +89,13 @@ def _print_bench(document: Mapping[str, Any]) -> None:
             spread = f"{_duration(run['p10'])} to {_duration(run['p90'])}"
             cells = [compiling, _duration(run["median"]), spread, str(run["repeats"])]
         found = [_FIGURES[name](value) for name, value in record["figures"].items()]
+        others = f"\nothers: {record['reference']}" if record["reference"] else ""
         table.add_row(
-            f"{record['name']}\n{record['title']}",
+            f"{record['name']}\n{record['title']}{others}",
             *cells,
             record["note"] or ", ".join(found),
             record["target"] or "",
             {True: "yes", False: "no", None: ""}[record["met"]],
-            record["reference"] or "",
             end_section=after is None or after["group"] != record["group"],
         )
     print_table(table)

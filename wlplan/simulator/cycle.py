@@ -21,6 +21,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from wlplan.compilation import stored
 from wlplan.heightmap import STATE_DISPLACEMENT
 from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
 from wlplan.simulator import controller, loader, terrain
@@ -206,7 +207,7 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     x, z = loader.bucket_tip(machine, state.position, state.boom, state.tilt)
     bucket = terrain.Bucket(x, z, state.tilt)
     soil_force = terrain.reaction(machine, soil, state.height, state.fill, bucket, wanted)
-    soil_force = terrain.stored(soil_force, wanted)
+    soil_force = stored(soil_force, wanted)
     load = soil_force.content_mass * GRAVITY
     vertical = soil_force.vertical
 

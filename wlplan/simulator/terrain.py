@@ -17,17 +17,16 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from wlplan.automaton import FLOW_FRACTION
+from wlplan.compilation import stored
 from wlplan.heightmap import STATE_CELLS, STATE_DISPLACEMENT, local_axes
 from wlplan.machine import Soil, WheelLoader
 from wlplan.simulator.soil import least_resistance, wedge_of
-from wlplan.types import PyTree
 from wlplan.units import CELL_SIZE, GRAVITY
 
 _ALONG, _LEFT = local_axes(STATE_CELLS, STATE_DISPLACEMENT)
@@ -107,15 +106,6 @@ def total(values: Float[Array, "n ..."]) -> Float[Array, "..."]:
             rest = rest + values[-1]
         values = values[:half] + values[half : 2 * half]
     return values[0] + rest
-
-
-def stored(values: PyTree, wanted: Bool[Array, ""]) -> PyTree:
-    """Arrays as they are, or zeros where they are not wanted.
-
-    A branch makes XLA store the arrays. Else it computes them anew in each operation that uses
-    them, and for each element of a larger array that they are part of.
-    """
-    return lax.cond(wanted, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
 
 
 def _hat(distance: Array, half_width: float) -> Array:

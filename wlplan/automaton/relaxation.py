@@ -230,33 +230,56 @@ def _go_beyond(
 ) -> tuple[Array, Array, Array]:
     """The next window of an avalanche, whether there is one, and whether it has left the first.
 
-    It goes on where the pile is too steep and steeper than it was before the loading. If that is
-    so across a side of the first window, the whole grid is searched for the steepest such place,
-    and again after every further window.
+    It goes on where the pile is too steep and steeper than it was before the loading. Such places
+    can only lie across the sides of windows: those of this one are looked at first, then, if there
+    was another before, the whole grid.
     """
+    cells, window = jnp.asarray(height.shape, jnp.int32), jnp.asarray(shape, jnp.int32)
 
-    def worst(before: Pile, height: Array) -> Array:
-        active = movable(before, repose_angle)
-        pairs = zip(rises(height, active), rises(before.height, active), strict=True)
-        worse = (jnp.where((now > limit) & (now > then), now, 0.0) for now, then in pairs)
+    def steepness(first: Array, sizes: tuple[int, ...]) -> Array:
+        """Of such places in a part of the grid; elsewhere 0."""
+        before = cut_out(pile, first, sizes)
+        now, active = lax.dynamic_slice(height, first, sizes), movable(before, repose_angle)
+        pairs = zip(rises(now, active), rises(before.height, active), strict=True)
+        worse = (jnp.where((a > limit) & (a > b), a, 0.0) for a, b in pairs)
         return functools.reduce(jnp.maximum, worse)
 
-    beyond = [left]
+    def around(cell: Array) -> Array:
+        return jnp.clip(cell - window // 2, 0, cells - window)
+
+    # How much there is of them at each cell along the four sides.
+    sides, firsts = [], []
     for axis in (0, 1):
         # Two cells on either side; at the border of the grid these lie inside the window.
         sizes = tuple(4 if k == axis else n for k, n in enumerate(shape))
         for side in (0, shape[axis]):
-            first = start.at[axis].add(side - 2)
-            strip = lax.dynamic_slice(height, first, sizes)
-            beyond.append(worst(cut_out(pile, first, sizes), strip).sum() > 0.0)
-    left = functools.reduce(jnp.logical_or, beyond)
+            first = jnp.clip(start.at[axis].add(side - 2), 0, cells - jnp.asarray(sizes, jnp.int32))
+            sides.append(steepness(first, sizes).sum(axis=axis))
+            firsts.append(first)
+    amounts = jnp.stack([side.sum() for side in sides])
+    across = amounts.sum() > 0.0
+    left = left | across
 
-    def search() -> tuple[Array, Array]:
-        steep = worst(pile, height)
-        cell = jnp.stack(jnp.unravel_index(jnp.argmax(steep), steep.shape)).astype(jnp.int32)
-        sizes = jnp.asarray(shape, jnp.int32)
-        first = jnp.clip(cell - sizes // 2, 0, jnp.asarray(steep.shape, jnp.int32) - sizes)
-        return first, steep.max() > 0.0
+    def beside() -> tuple[Array, Array]:
+        """A window around the place with most along the side with most."""
+        along = ((0, 1), (0, 1), (1, 0), (1, 0))
+        places = [
+            first + jnp.argmax(side).astype(jnp.int32) * jnp.asarray(unit, jnp.int32)
+            for first, side, unit in zip(firsts, sides, along, strict=True)
+        ]
+        return around(jnp.stack(places)[jnp.argmax(amounts)]), jnp.array(True)
 
-    start, steep = lax.cond(left, search, lambda: (start, jnp.array(False)))
+    def anywhere() -> tuple[Array, Array]:
+        """A window around the steepest of the column with most."""
+        # XLA's argmax over two axes takes longer on a CPU than the rest of the search.
+        steep = steepness(jnp.zeros(2, jnp.int32), height.shape)
+        columns = steep.sum(axis=0)
+        j = jnp.argmax(columns)
+        i = jnp.argmax(lax.dynamic_slice_in_dim(steep, j, 1, axis=1))
+        return around(jnp.stack([i, j]).astype(jnp.int32)), columns[j] > 0.0
+
+    def nowhere() -> tuple[Array, Array]:
+        return start, jnp.array(False)
+
+    start, steep = lax.cond(across, beside, lambda: lax.cond(left, anywhere, nowhere))
     return start, steep, left

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 
 from wlplan.automaton.neighbours import BITS, NEIGHBOURS, links_of, neighbour, rim
 from wlplan.automaton.slopes import movable, steeper_than
+from wlplan.compilation import kept
 from wlplan.machine import GRAVEL
 from wlplan.types import Pile
 
@@ -113,53 +114,58 @@ def slide(
 
     The velocity is dropped when it points uphill, against what the sweep itself would do.
     """
+    if momentum == 0.0:
+
+        def plain(_: Array, rimmed: Array) -> Array:
+            return rim(neighbour(rimmed, 0, 0) - FLOW_FRACTION * _outflow(rimmed, drop, links))
+
+        return neighbour(lax.fori_loop(0, count, plain, rim(height)), 0, 0)
 
     def step(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        rimmed, velocity = state
-        flow = -FLOW_FRACTION * _outflow(rimmed, drop, links)
-        velocity = _kept_part(momentum, flow, velocity) * velocity + flow
-        return rim(neighbour(rimmed, 0, 0) + velocity), velocity
+        return _sweep_on(state, links, drop, momentum)[0]
 
-    def plain(_: Array, rimmed: Array) -> Array:
-        return rim(neighbour(rimmed, 0, 0) - FLOW_FRACTION * _outflow(rimmed, drop, links))
-
-    if momentum == 0.0:
-        return neighbour(lax.fori_loop(0, count, plain, rim(height)), 0, 0)
-    rimmed, _ = lax.fori_loop(0, count, step, (rim(height), jnp.zeros_like(height)))
+    rimmed, _ = lax.fori_loop(0, count, step, _at_standstill(height))
     return neighbour(rimmed, 0, 0)
 
 
-def _kept_part(momentum: float, flow: Array, velocity: Array) -> Array:
+def _at_standstill(height: Array) -> tuple[Array, Array]:
+    return rim(height), jnp.zeros_like(height)
+
+
+def _sweep_on(
+    state: tuple[Array, Array], links: Array | None, drop: float, momentum: float
+) -> tuple[tuple[Array, Array], Array]:
+    """Surface with its rim and velocity after one more sweep, and how much velocity was kept."""
+    rimmed, velocity = state
+    flow = kept(-FLOW_FRACTION * _outflow(rimmed, drop, links), rimmed[0, 0])
     uphill = jnp.vdot(flow, velocity) < 0.0
-    return jnp.where(uphill, jnp.zeros((), flow.dtype), jnp.asarray(momentum, flow.dtype))
+    part = jnp.where(uphill, jnp.zeros((), flow.dtype), jnp.asarray(momentum, flow.dtype))
+    velocity = part * velocity + flow
+    return (rim(neighbour(rimmed, 0, 0) + velocity), velocity), part
 
 
 def _slide_forward(height: Array, links: Array | None, drop: float, momentum: float, count: int):
     def step(state: tuple[Array, Array], _: None):
-        rimmed, velocity = state
-        flow = -FLOW_FRACTION * _outflow(rimmed, drop, links)
-        kept = _kept_part(momentum, flow, velocity)
-        velocity = kept * velocity + flow
-        return (rim(neighbour(rimmed, 0, 0) + velocity), velocity), (rimmed, kept)
+        after, part = _sweep_on(state, links, drop, momentum)
+        return after, (state[0], part)
 
-    start = (rim(height), jnp.zeros_like(height))
-    (rimmed, _), record = lax.scan(step, start, None, length=count)
+    (rimmed, _), record = lax.scan(step, _at_standstill(height), None, length=count)
     return neighbour(rimmed, 0, 0), (*record, links)
 
 
 def _slide_backward(drop: float, momentum: float, count: int, record, cotangent: Array):
-    surfaces, kept, links = record
+    surfaces, parts, links = record
 
     # `both` is the cotangent of a sweep's velocity: that of the next velocity and of the surface.
     # Carried with its rim, as the flow is: XLA makes far slower code of the other ways tried.
     def step(state: tuple[Array, Array], recorded: tuple[Array, Array]):
         height, both = state
-        surface, kept = recorded
+        surface, part = recorded
         height = height - FLOW_FRACTION * rim(_spread(both, surface, drop, links))
-        return (height, kept * both + height), None
+        return (height, part * both + height), None
 
     start = (rim(cotangent), rim(cotangent))
-    (height, _), _ = lax.scan(step, start, (surfaces, kept), reverse=True)
+    (height, _), _ = lax.scan(step, start, (surfaces, parts), reverse=True)
     return neighbour(height, 0, 0), None
 
 
