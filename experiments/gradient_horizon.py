@@ -28,7 +28,7 @@ from wlplan.units import ACTION_HIGH, ACTION_LOW
 # pile has a large gradient of its own.
 KIND, SLOPE_DEGREES, HEIGHT, SEED = "conical", 30.0, 5.0, 1
 PLANS = 8
-HORIZONS = {"low": (1, 2, 5, 10, 20, 50, 100), "simulator": (1, 2, 5, 10)}
+HORIZONS = {"low": (1, 2, 5, 10, 20, 50, 100), "simulator": (1, 2, 5, 10, 20, 50, 100)}
 MEMORY_LOADS = (10, 100)
 MEMORY_LIMIT = 2 * 2**30
 # A change of a component that is about as much as any other [m, m, rad, then of the action].
