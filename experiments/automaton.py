@@ -40,11 +40,13 @@ SCHEDULES = {
     "levels, no momentum": dataclasses.replace(_WITHOUT_LIMIT, momentum=0.0),
     "momentum, no levels": dataclasses.replace(_WITHOUT_LIMIT, sweeps=(40,)),
     "two levels": dataclasses.replace(_WITHOUT_LIMIT, sweeps=(6, 8)),
-    "four levels": dataclasses.replace(_WITHOUT_LIMIT, sweeps=(6, 8, 10, 12)),
-    "twice the sweeps": dataclasses.replace(_WITHOUT_LIMIT, sweeps=(12, 16, 20)),
-    "four times": dataclasses.replace(_WITHOUT_LIMIT, sweeps=(24, 32, 40)),
+    "four levels": dataclasses.replace(_WITHOUT_LIMIT, sweeps=(6, 8, 12, 12)),
+    "more on the coarsest": dataclasses.replace(_WITHOUT_LIMIT, sweeps=(6, 8, 24)),
+    "twice the sweeps": dataclasses.replace(_WITHOUT_LIMIT, sweeps=(12, 16, 24)),
+    "four times": dataclasses.replace(_WITHOUT_LIMIT, sweeps=(24, 32, 48)),
     "momentum 0.8": dataclasses.replace(_WITHOUT_LIMIT, momentum=0.8),
-    "momentum 0.95": dataclasses.replace(_WITHOUT_LIMIT, momentum=0.95),
+    "momentum 0.9": dataclasses.replace(_WITHOUT_LIMIT, momentum=0.9),
+    "momentum 0.97": dataclasses.replace(_WITHOUT_LIMIT, momentum=0.97),
 }
 SMOKE_SCHEDULES = ("default", "levels, no momentum", "momentum, no levels")
 PLAIN = "plain sweeps"

@@ -464,7 +464,7 @@ def test_the_names_offered_are_those_that_exist():
     assert cli.options.WORLDS == worlds.WORLDS
     assert cli.options.PLANNERS == planner.PLANNERS
     assert tuple(objective.OBJECTIVES) == cli.options.OBJECTIVES
-    assert tuple(io._READERS) == cli.inputs.PILE_ENDINGS
+    assert tuple(io.scans._READERS) == cli.inputs.PILE_ENDINGS
 
 
 class _Strict(HTMLParser):

@@ -13,21 +13,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan import dataset as module
 from wlplan.dataset import (
     VARIABLES,
     Dataset,
-    Normaliser,
-    choose_pose,
     collect,
     fingerprint,
     open_dataset,
+    protocol,
     reflect,
     split,
+    workbench,
 )
+from wlplan.dataset import store as stored
+from wlplan.dataset.protocol import Layout, Rollout, choose_pose
 from wlplan.errors import InputError
 from wlplan.heightmap import sample_local
 from wlplan.machine import GRAVEL
+from wlplan.models.normaliser import Normaliser
 from wlplan.pile import SEED_PILES, seed_pile
 from wlplan.sampling import latin_hypercube
 from wlplan.simulator import STOP_REASONS, Simulator
@@ -41,8 +43,9 @@ CYCLES, SEED = 11, 5
 def _short_rollouts():
     """Rollouts of 3 loadings, two a batch: 11 cycles make two batches."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "LOADS", 3)
-        patch.setattr(module, "_BATCH", 2)
+        for part in (protocol, workbench, stored):
+            patch.setattr(part, "LOADS", 3)
+        patch.setattr(protocol, "_BATCH", 2)
         yield
 
 
@@ -137,7 +140,7 @@ def test_the_volume_that_the_map_loses_is_about_the_load(data):
 def played(rollout):
     """A rollout after all its loadings, alone on its bench."""
     rollouts, finished = iter([rollout]), []
-    bench = module._Bench(
+    bench = workbench._Bench(
         Simulator(), lambda: next(rollouts, None), finished.append, threading.Event()
     )
     bench.run()
@@ -147,13 +150,13 @@ def played(rollout):
 
 def test_a_rollout_does_not_depend_on_those_beside_it(data):
     for number in (0, 2):
-        alone = played(module._Rollout(number, SEED, 3, Simulator())).records()
+        alone = played(Rollout(number, SEED, 3, Simulator())).records()
         for name in VARIABLES:
             np.testing.assert_array_equal(alone[name], getattr(data, name)[data.rollout == number])
 
 
 def test_what_left_the_grid_is_the_load():
-    rollout = module._Rollout(3, SEED, 1, Simulator())
+    rollout = Rollout(3, SEED, 1, Simulator())
     rollout.heap()
     before, origin = rollout.height, rollout.origin
     after = played(rollout).height
@@ -170,11 +173,11 @@ def test_what_left_the_grid_is_the_load():
 
 
 def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike():
-    first, again, other = (module._Rollout(3, seed, 3, Simulator()) for seed in (0, 0, 1))
+    first, again, other = (Rollout(3, seed, 3, Simulator()) for seed in (0, 0, 1))
     assert first.noise_seed == again.noise_seed != other.noise_seed
     np.testing.assert_array_equal(first.action, again.action)
     assert not np.any(first.place == other.place)
-    headings = np.concatenate([module._Rollout(n, 0, 3, Simulator()).turn for n in range(60)])
+    headings = np.concatenate([Rollout(n, 0, 3, Simulator()).turn for n in range(60)])
     assert np.abs(headings).max() <= math.radians(10.0)
     assert headings.std() == pytest.approx(math.radians(20.0) / math.sqrt(12.0), rel=0.1)
 
@@ -182,8 +185,8 @@ def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike():
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30, 31, 47, 449, 451, 1801, 10_718, 10_800])
 def test_the_batches_make_up_the_cycles(cycles, monkeypatch):
     for name, value in (("LOADS", 30), ("_BATCH", 60)):
-        monkeypatch.setattr(module, name, value)
-    layout = module._Layout(cycles)
+        monkeypatch.setattr(protocol, name, value)
+    layout = Layout(cycles)
     assert layout.rollouts * 30 >= cycles > (layout.rollouts - 1) * 30
     # A batch starts with a rollout, and with a chunk.
     assert layout.batch_cycles == cycles or layout.batch_cycles % 30 == 0
@@ -261,7 +264,7 @@ def test_missing_directories_above_are_made(tmp_path):
 
 @pytest.mark.parametrize("cores", [1, 3])
 def test_the_number_of_cores_does_not_show(store, tmp_path, monkeypatch, cores):
-    monkeypatch.setattr(module, "cores", lambda: cores)
+    monkeypatch.setattr(workbench, "cores", lambda: cores)
     collect(tmp_path / "data.zarr", cycles=CYCLES, seed=SEED)
     assert contents(tmp_path / "data.zarr") == contents(store)
 
@@ -270,14 +273,14 @@ def test_what_goes_wrong_beside_is_not_lost(tmp_path, monkeypatch):
     def fails(*_):
         raise RuntimeError("no toe")
 
-    monkeypatch.setattr(module, "choose_pose", fails)
+    monkeypatch.setattr(protocol, "choose_pose", fails)
     with pytest.raises(RuntimeError, match="no toe"):
         collect(tmp_path / "data.zarr", cycles=CYCLES, seed=SEED)
     assert "collect" not in [thread.name for thread in threading.enumerate()]
 
 
 def test_a_batch_that_was_half_written_is_written_again(store, copy):
-    module._update_attributes(copy, {"cycles_done": 6})
+    stored.update_attributes(copy, {"cycles_done": 6})
     chunk = copy / "h52" / "c" / "1" / "0" / "0"
     chunk.write_bytes(chunk.read_bytes()[:100])
     (copy / "mass" / "c" / "1").unlink()
@@ -311,7 +314,7 @@ def test_another_collection_does_not_go_on_in_the_same_place(copy, changed, word
 
 def test_two_processes_do_not_write_the_same_store(copy):
     lock = copy.with_name("copy.zarr.lock")
-    lock.write_text(f"{os.getpid()} {module._start_of(os.getpid())} {socket.gethostname()}")
+    lock.write_text(f"{os.getpid()} {stored._start_of(os.getpid())} {socket.gethostname()}")
     refused(lambda: collect(copy, cycles=CYCLES, seed=SEED), str(os.getpid()), lock.name)
     assert lock.exists()
 
@@ -326,16 +329,16 @@ def test_the_lock_of_a_dead_process_is_taken_over(copy, holder):
 
 def test_a_full_disk_is_said_in_one_line_and_costs_nothing(store, tmp_path, monkeypatch):
     path = tmp_path / "data.zarr"
-    write = module._write
+    write = stored.write
 
     def fails(path, batch, start):
         if start > 0:
             raise OSError(errno.ENOSPC, "No space left on device")
         write(path, batch, start)
 
-    monkeypatch.setattr(module, "_write", fails)
+    monkeypatch.setattr(stored, "write", fails)
     refused(lambda: collect(path, cycles=CYCLES, seed=SEED), "No space", "6 of 11")
-    monkeypatch.setattr(module, "_write", write)
+    monkeypatch.setattr(stored, "write", write)
     collect(path, cycles=CYCLES, seed=SEED)
     assert contents(path) == contents(store)
 
@@ -356,7 +359,7 @@ def test_other_things_are_not_overwritten(tmp_path):
 def test_a_missing_or_foreign_store_is_refused(tmp_path, copy):
     refused(lambda: open_dataset(tmp_path / "nothing.zarr"), "no such data set")
     refused(lambda: open_dataset(tmp_path), "not a data set")
-    module._update_attributes(copy, {"format": "wlplan.dataset/9"})
+    stored.update_attributes(copy, {"format": "wlplan.dataset/9"})
     refused(lambda: open_dataset(copy), "wlplan.dataset/9")
     (copy / "zarr.json").write_text("{")
     refused(lambda: open_dataset(copy), "not a data set")

@@ -469,8 +469,8 @@ def test_a_missing_reader_says_what_to_install(tmp_path, monkeypatch, ending, mo
             raise ModuleNotFoundError(name)
         return real(name, *rest)
 
-    real = io.importlib.import_module
-    monkeypatch.setattr(io.importlib, "import_module", without_it)
+    real = io.scans.importlib.import_module
+    monkeypatch.setattr(io.scans.importlib, "import_module", without_it)
     path = tmp_path / f"pile{ending}"
     path.write_bytes(b"x")
     refused(path, r"pip install wlplan\[scan\]")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from wlplan.dataset import Normaliser
 from wlplan.errors import InputError
+from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance import (
     ACTIVATIONS,
     INPUTS,

@@ -27,8 +27,9 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Float
 
-from wlplan.dataset import Dataset, Normaliser, fingerprint, split, versions
+from wlplan.dataset import Dataset, fingerprint, split, versions
 from wlplan.errors import InputError
+from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel, PsiLow
 
 MODEL_FORMAT = "wlplan.model/1"

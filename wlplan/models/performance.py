@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from flax import nnx, struct
 from jaxtyping import Array, Float
 
-from wlplan.dataset import Normaliser
 from wlplan.errors import InputError
+from wlplan.models.normaliser import Normaliser
 from wlplan.types import Performance
 
 INPUTS = 8

@@ -1,4 +1,4 @@
-"""Scans and plans on disk. Whatever is wrong with a file comes back as one `InputError` line.
+"""Scans on disk: height maps and point clouds.
 
 The world frame of a scan is its own, x east, y north, z up, in metres. Coordinates of a survey are
 too large for float32, so whole kilometres are taken off x and y when the map lies more than 10 km
@@ -12,14 +12,12 @@ import contextlib
 import dataclasses
 import importlib
 import io
-import json
 import logging
 import math
 import os
-import secrets
 import struct
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from importlib import resources
 from pathlib import Path
 from types import ModuleType
@@ -32,11 +30,10 @@ from scipy import ndimage
 
 from wlplan.errors import InputError
 from wlplan.ground import estimate_ground, fill_unseen
+from wlplan.io.files import check_is_file, floats, named, one_line, write_bytes_atomic
 from wlplan.pile import ground_height, resample
-from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
-from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE
-
-PLAN_FORMAT = "wlplan.plan/1"
+from wlplan.types import Pile
+from wlplan.units import CELL_SIZE
 
 # Shortest side of a map that a bucket with its surroundings fits into [m], a little more than the
 # 3.6 m window of the models, and most cells a side that are taken.
@@ -53,8 +50,6 @@ _HIGH = 100.0
 # A point cloud is gridded at this many times its mean spacing where that is more than a cell: two
 # points a cell leave few cells empty.
 _SPACINGS = 1.5
-# Slack on the box of the actions, for numbers that went through float32.
-_ROUNDING = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,8 +105,8 @@ def read_pile(
         raise InputError(
             f"{path}: unknown kind of pile file {path.suffix!r}: use one of {', '.join(_READERS)}."
         )
-    _check_is_file(path, "pile")
-    with _named(path):
+    check_is_file(path, "pile")
+    with named(path):
         try:
             with warnings.catch_warnings(), _silent("rasterio", "laspy"):
                 warnings.simplefilter("ignore")
@@ -122,7 +117,7 @@ def read_pile(
             # Damaged bytes make third-party readers raise almost anything, from zlib.error to
             # MemoryError; to the user they all mean the same.
             raise InputError(
-                f"cannot be read as {path.suffix.lower()} ({_one_line(error)}): the file is "
+                f"cannot be read as {path.suffix.lower()} ({one_line(error)}): the file is "
                 f"damaged or cut short; copy or export it again."
             ) from error
         return _to_pile(scan, ground)
@@ -176,16 +171,16 @@ def _to_pile(scan: _Scan, ground: Array | np.ndarray | float | None) -> Pile:
     sea_level = 100.0 * math.floor(low / 100.0) if abs(low) > _HIGH else 0.0
     pile = resample(
         Pile(
-            height=_floats(height - sea_level),
+            height=floats(height - sea_level),
             cell_size=scan.cell_size,
-            origin=_floats(origin),
-            ground=None if floor is None else _floats(floor - sea_level),
+            origin=floats(origin),
+            ground=None if floor is None else floats(floor - sea_level),
             valid=None if valid.all() else jnp.asarray(valid),
         ),
         CELL_SIZE,
     )
     if floor is None:
-        found = _floats(estimate_ground(pile.height, CELL_SIZE, pile.valid))
+        found = floats(estimate_ground(pile.height, CELL_SIZE, pile.valid))
         pile = pile.replace(ground=jnp.minimum(found, pile.height))
     return pile.replace(cell_size=CELL_SIZE)
 
@@ -224,11 +219,6 @@ def _real(name: str, values: Any) -> np.ndarray:
         raise InputError(f"`{name}` holds {values.dtype} values: store real numbers.")
     with np.errstate(invalid="ignore"):  # a NaN of damaged bytes may be a signalling one
         return values.astype(np.float64)
-
-
-def _floats(values: np.ndarray) -> Array:
-    """float32, or float64 under `jax_enable_x64`."""
-    return jnp.asarray(values.astype(jnp.zeros(()).dtype))
 
 
 def _read_npz(path: Path) -> _Scan:
@@ -442,183 +432,6 @@ def write_pile(path: str | os.PathLike[str], pile: Pile) -> None:
     write_bytes_atomic(path, buffer.getvalue())
 
 
-def plan_to_dict(
-    plan: LoadingPlan,
-    *,
-    predicted: Performance | None = None,
-    simulated: Performance | None = None,
-    transport: Mapping[str, Any] | None = None,
-    **rest: Any,
-) -> dict[str, Any]:
-    """Lay a plan out as the content of a plan.json.
-
-    Args:
-        plan: The loadings, leaves [N].
-        predicted: Performance by the world that planned, leaves [N], tonne, s, kJ.
-        simulated: Performance in the simulator, likewise.
-        transport: Arrays [N] by name, "time" [s] and "work" [kJ], of driving to the truck and back.
-        **rest: Further top-level fields: pile, world, objective, seed, total, ledger.
-    """
-    pose, action = _columns(plan.pose), _columns(plan.action)
-    extra = {
-        "predicted": predicted and _columns(predicted),
-        "transport": transport and {name: np.asarray(v).tolist() for name, v in transport.items()},
-        "simulated": simulated and _columns(simulated),
-    }
-    loads = []
-    for n in range(len(pose["x"])):
-        load: dict[str, Any] = {name: values[n] for name, values in pose.items()}
-        load["action"] = {name: values[n] for name, values in action.items()}
-        for part, columns in extra.items():
-            if columns:
-                load[part] = {name: values[n] for name, values in columns.items()}
-        loads.append(load)
-    return {"format": PLAN_FORMAT, **rest, "loads": loads}
-
-
-def _columns(record: Any) -> dict[str, list[float]]:
-    return {
-        field.name: np.asarray(getattr(record, field.name), np.float64).tolist()
-        for field in dataclasses.fields(record)
-    }
-
-
-def write_plan(path: str | os.PathLike[str], document: Mapping[str, Any]) -> None:
-    """Write the content of a plan.json, in one piece or not at all.
-
-    Args:
-        path: File to write.
-        document: Content as of `plan_to_dict`; numpy and JAX numbers are taken too.
-
-    Raises:
-        InputError: If `read_plan` would refuse it, or the file cannot be written.
-    """
-    with _named(Path(path)):
-        text = json.dumps(
-            dict(document), indent=2, default=lambda value: np.asarray(value).tolist()
-        )
-        _parse_plan(text)
-    write_text_atomic(path, text + "\n")
-
-
-def read_plan(path: str | os.PathLike[str]) -> tuple[LoadingPlan, dict[str, Any]]:
-    """Read a plan.json.
-
-    Returns:
-        The plan, leaves [N], and the whole document.
-
-    Raises:
-        InputError: If it is not a plan that can be played; one line that says where and why.
-    """
-    path = Path(path)
-    _check_is_file(path, "plan")
-    with _named(path):
-        try:
-            text = path.read_bytes().decode()
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"cannot be read ({_one_line(error)}): is it a plan.json?") from error
-        return _parse_plan(text)
-
-
-def _parse_plan(text: str) -> tuple[LoadingPlan, dict[str, Any]]:
-    try:
-        document = json.loads(text, parse_float=_finite, parse_constant=_finite)
-    except InputError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"is not valid JSON ({_one_line(error)}): write the plan again."
-        ) from error
-    found = document.get("format") if isinstance(document, dict) else None
-    if found != PLAN_FORMAT:
-        raise InputError(
-            f"has format {_one_line(repr(found))}, not {PLAN_FORMAT!r}: it is not a plan, or one "
-            f"for another version of wlplan."
-        )
-    loads = document.get("loads")
-    if not isinstance(loads, list) or not loads:
-        raise InputError("has no loads: `loads` has to be a list with at least one loading.")
-    pose_names = [field.name for field in dataclasses.fields(Pose)]
-    action_names = [field.name for field in dataclasses.fields(Action)]
-    poses, actions = [], []
-    for n, load in enumerate(loads, start=1):
-        poses.append([_number(load, name, f"load {n}") for name in pose_names])
-        action = _member(load, "action", f"load {n}")
-        actions.append([_number(action, name, f"load {n}, action") for name in action_names])
-        for name, value, low, high in zip(
-            action_names, actions[-1], ACTION_LOW, ACTION_HIGH, strict=True
-        ):
-            if not low - _ROUNDING <= value <= high + _ROUNDING:
-                raise InputError(
-                    f"load {n}: {name} is {value:g}, outside its range {low:g} to {high:g}."
-                )
-    actions_in_box = np.clip(np.array(actions), ACTION_LOW, ACTION_HIGH)
-    plan = LoadingPlan(
-        pose=Pose(*(_floats(column) for column in np.array(poses).T)),
-        action=Action(*(_floats(column) for column in actions_in_box.T)),
-    )
-    return plan, document
-
-
-def _member(record: Any, name: str, where: str) -> Any:
-    if not isinstance(record, dict) or name not in record:
-        raise InputError(f"{where}: `{name}` is missing.")
-    return record[name]
-
-
-def _number(record: Any, name: str, where: str) -> float:
-    value = _member(record, name, where)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e30:
-        raise InputError(f"{where}: `{name}` is {_one_line(repr(value))}, not a finite number.")
-    return float(value)
-
-
-def _finite(text: str) -> float:
-    """Refuse NaN, infinity and numbers too large, which Python's JSON reader lets through."""
-    value = float(text)
-    if not math.isfinite(value):
-        raise InputError(f"holds {_one_line(text)}: every number of a plan has to be finite.")
-    return value
-
-
-def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file as UTF-8, in one piece or not at all: see `write_bytes_atomic`."""
-    write_bytes_atomic(path, text.encode())
-
-
-def write_bytes_atomic(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write a file beside its target and move it there, so that no reader sees half of it.
-
-    Raises:
-        InputError: If the folder is missing or the file cannot be written there. The target is then
-            as it was.
-    """
-    path = Path(path)
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        try:
-            with beside.open("xb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(beside, path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                beside.unlink()
-            raise
-    except OSError as error:
-        reason = error.strerror or _one_line(error)
-        raise InputError(f"{path}: cannot be written ({reason}): choose another place.") from error
-
-
-def _check_is_file(path: Path, what: str) -> None:
-    # Unlike Path.exists, these take names that no file can have for missing ones.
-    if os.path.isdir(path):
-        raise InputError(f"{path}: is a folder: name the {what} file itself.")
-    if not os.path.exists(path):
-        raise InputError(f"{path}: no such {what} file: check the name.")
-
-
 def _optional(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
@@ -626,15 +439,6 @@ def _optional(name: str) -> ModuleType:
         raise InputError(
             f"needs {name}, which is not installed: run `pip install wlplan[scan]`."
         ) from error
-
-
-@contextlib.contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Put the name of the file before the message of an `InputError`."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error.__cause__
 
 
 @contextlib.contextmanager
@@ -663,9 +467,3 @@ def _mute_stderr() -> Iterator[None]:
         os.dup2(keep, 2)
         os.close(keep)
         os.close(nowhere)
-
-
-def _one_line(error: object) -> str:
-    """The gist of a message: one line, at most 120 characters."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 120 else text[:117] + "..."

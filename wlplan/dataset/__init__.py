@@ -1,0 +1,27 @@
+"""Training data: loading cycles played by the simulator, stored, split and normalised.
+
+The protocol is the paper's (section 6.2). A rollout takes one of the six seed piles, with noise of
+its own, and digs it 30 times in a row; each loading starts at a random accessible point of the toe
+of the pile as it then is, heads into it to within 10 degrees of the normal, and takes its action
+from a Latin hypercube. A set is one rollout of each seed pile; its 180 actions are one hypercube.
+
+Everything random about a rollout follows from the seed and the number of the rollout alone, so a
+collection that was cut short goes on where it stopped and ends with the same bytes.
+"""
+
+from wlplan.dataset.collecting import collect
+from wlplan.dataset.store import DATASET_FORMAT, open_dataset, versions
+from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, fingerprint, reflect, split
+
+__all__ = [
+    "DATASET_FORMAT",
+    "LOADS",
+    "VARIABLES",
+    "Dataset",
+    "collect",
+    "fingerprint",
+    "open_dataset",
+    "reflect",
+    "split",
+    "versions",
+]

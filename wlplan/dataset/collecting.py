@@ -1,0 +1,71 @@
+"""Collecting: play what is missing of a data set and store it."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from wlplan.dataset import store
+from wlplan.dataset.protocol import Layout
+from wlplan.dataset.workbench import batches_of
+from wlplan.errors import InputError
+from wlplan.simulator import Simulator
+
+_SIMULATOR = Simulator()
+
+
+def collect(
+    path: str | os.PathLike[str],
+    *,
+    cycles: int,
+    seed: int = 0,
+    simulator: Simulator = _SIMULATOR,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Plays loading cycles and stores them; goes on where an earlier call stopped.
+
+    A data set of more cycles is a longer series of the same rollouts. Cycles are written batch by
+    batch; what was written stays intact whatever happens to the process.
+
+    Args:
+        path: Directory of the data set, a zarr (version 3) group; by custom it ends in `.zarr`.
+            Missing directories above it are made.
+        cycles: Number of loading cycles; the last rollout is cut short to meet it.
+        seed: Seed of piles, poses and actions.
+        simulator: The simulator with its machine and soil.
+        progress: Called with the number of cycles played so far and in all.
+
+    Raises:
+        InputError: If the path holds something else or a data set of another seed, number of
+            cycles or simulator; if another process writes it; or if it cannot be written.
+    """
+    path = Path(path)
+    if cycles < 1:
+        raise InputError(f"{cycles} cycles asked for: it has to be at least 1.")
+    if seed < 0:
+        raise InputError(f"The seed is {seed}: it has to be 0 or more.")
+    layout = Layout(cycles)
+    done = 0
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)  # the lock goes there
+        with store.lock(path):
+            wanted = store.identity(cycles, seed, simulator)
+            if store.is_new(path):
+                store.create(path, layout, wanted)
+            done = store.resume(path, wanted)
+            if progress is not None:
+                progress(done, cycles)
+            with contextlib.closing(batches_of(layout, done, seed, simulator, progress)) as batches:
+                for batch in batches:
+                    store.write(path, batch, done)
+                    done += len(batch["mass"])
+                    store.update_attributes(path, {"cycles_done": done})
+    except OSError as error:
+        reason = error.strerror or str(error) or type(error).__name__
+        advice = "free some space" if error.errno == errno.ENOSPC else "choose another place"
+        if done:
+            advice += f"; {done} of {cycles} cycles are safe, the same command goes on from there"
+        raise InputError(f"{path}: cannot be written ({reason}): {advice}.") from error

@@ -1,0 +1,170 @@
+"""The paper's protocol: which piles are dug where, with which actions, and what is recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from wlplan.automaton import relax
+from wlplan.dataset.variables import LOADS, VARIABLES
+from wlplan.errors import InputError
+from wlplan.pile import SEED_PILES, seed_pile, toe_contour
+from wlplan.sampling import latin_hypercube
+from wlplan.simulator import Simulator
+from wlplan.types import Pile
+from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE
+
+# Rollouts that are written as one batch: one chunk of every variable, 19 MB of the largest.
+_BATCH = 60
+# Largest deviation of the heading from the normal of the toe [rad]. Paper, section 6.2.
+_HEADING_SPREAD = math.radians(10.0)
+# What the random streams are for; part of their keys.
+_ROLLOUT_STREAM, _ACTION_STREAM = 0, 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """How many cycles are rolled out in which portions."""
+
+    cycles: int
+
+    @property
+    def rollouts(self) -> int:
+        """Rollouts to play, the last perhaps in part."""
+        return math.ceil(self.cycles / LOADS)
+
+    @property
+    def loads(self) -> int:
+        """Loadings to play of each rollout."""
+        return min(LOADS, self.cycles)
+
+    @property
+    def batch_cycles(self) -> int:
+        """Cycles that are written at once."""
+        return min(_BATCH * LOADS, self.cycles)
+
+
+class Rollout:
+    """A pile, what is random about digging it, and the loadings so far."""
+
+    def __init__(self, number: int, seed: int, loads: int, simulator: Simulator):
+        self.number = number
+        repeat, self.seed_pile = divmod(number, len(SEED_PILES))
+        key = np.random.SeedSequence(seed, spawn_key=(_ROLLOUT_STREAM, number))
+        random = np.random.default_rng(key)
+        self.noise_seed = int(random.integers(2**31))
+        self.place, turn = random.random((2, LOADS))  # [0, 1) along the accessible toe
+        self.turn = _HEADING_SPREAD * (2.0 * turn - 1.0)
+        key = np.random.SeedSequence(seed, spawn_key=(_ACTION_STREAM, repeat))
+        unit = latin_hypercube(len(SEED_PILES) * LOADS, 4, np.random.default_rng(key))
+        low, high = np.array(ACTION_LOW), np.array(ACTION_HIGH)
+        mine = slice(self.seed_pile * LOADS, (self.seed_pile + 1) * LOADS)
+        self.action = (low + (high - low) * unit[mine]).astype(np.float32)
+        self.loads = loads
+        self.simulator = simulator
+        self.pose = np.zeros(3, np.float32)
+        self.valid = False
+        self.played: list[dict[str, Any]] = []
+
+    def heap(self) -> None:
+        """Makes the pile; apart from the random numbers, for it takes time."""
+        shape = grid_shape()
+        kind, slope = SEED_PILES[self.seed_pile]
+        pile = seed_pile(kind, slope=slope, seed=self.noise_seed)
+        self.height = relaxer(self.simulator.soil.repose_angle)(_on_grid(pile, shape)).height
+        self.origin = grid_origin()
+
+    @property
+    def load(self) -> int:
+        """Number of the next loading."""
+        return len(self.played)
+
+    def prepare(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose and action of the next loading."""
+        pile = Pile(self.height, CELL_SIZE, self.origin)
+        pose = choose_pose(pile, self.place[self.load], self.turn[self.load])
+        self.valid = pose is not None
+        # A pile that is used up is dug where it was dug last; `valid` tells.
+        self.pose = self.pose if pose is None else pose
+        return self.pose, self.action[self.load]
+
+    def take_in(self, height: Array, record: dict[str, Array]) -> None:
+        """The surface after the loading and its simulated variables."""
+        self.height = height
+        known = {
+            "action": self.action[self.load],
+            "pose": self.pose,
+            "valid": self.valid,
+            "rollout": self.number,
+            "seed_pile": self.seed_pile,
+            "load": self.load,
+        }
+        self.played.append(jax.tree.map(np.asarray, record) | known)
+
+    def records(self) -> dict[str, np.ndarray]:
+        """The variables of all loadings."""
+        return {
+            name: np.stack([load[name] for load in self.played]).astype(variable.dtype)
+            for name, variable in VARIABLES.items()
+        }
+
+
+def choose_pose(pile: Pile, place: float, turn: float) -> Float[np.ndarray, "3"] | None:
+    """A dig pose at the toe of a pile as it is: x, y [m] and heading [rad].
+
+    Args:
+        pile: One pile.
+        place: Which of the accessible points of the toe, 0 to 1 along it.
+        turn: Heading over the normal into the pile [rad].
+
+    Returns:
+        The pose; None if there is nothing left to dig.
+    """
+    try:
+        toe = toe_contour(pile)
+    except InputError:
+        return None
+    candidates = np.flatnonzero(toe.accessible)
+    if candidates.size == 0:
+        return None
+    at = candidates[min(int(place * candidates.size), candidates.size - 1)]
+    return np.array([*toe.points[at], toe.heading[at] + turn], np.float32)
+
+
+@functools.cache
+def grid_shape() -> tuple[int, int]:
+    """The smallest grid that holds each of the seed piles [cells]."""
+    shapes = [seed_pile(kind, slope=slope, noise=0.0).height.shape for kind, slope in SEED_PILES]
+    nx, ny = np.max(shapes, axis=0)
+    return int(nx), int(ny)
+
+
+def grid_origin() -> Float[Array, "2"]:
+    """Centre of the first cell of the grid; that of the grid is the world origin [m]."""
+    return jnp.asarray(-0.5 * CELL_SIZE * (np.array(grid_shape(), np.float32) - 1.0))
+
+
+def _on_grid(pile: Pile, shape: tuple[int, int]) -> Pile:
+    """A seed pile with level ground added on all sides; its centre stays the world origin."""
+    # Seed piles have an odd number of cells a side, so the rim is the same on both sides.
+    rim = [(n - old) // 2 for n, old in zip(shape, pile.height.shape, strict=True)]
+    return dataclasses.replace(
+        pile,
+        height=jnp.pad(pile.height, [(r, r) for r in rim]),
+        origin=jnp.asarray(pile.origin) - CELL_SIZE * jnp.asarray(rim, pile.height.dtype),
+    )
+
+
+@functools.cache
+def relaxer(repose_angle: float) -> Callable[[Pile], Pile]:
+    """`relax` for an angle of repose [rad], compiled."""
+    # One pile at a time, since `relax` stops as soon as the pile stands.
+    return jax.jit(functools.partial(relax, repose_angle=repose_angle))

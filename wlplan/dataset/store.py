@@ -1,0 +1,265 @@
+"""Data sets on disk: zarr groups that grow batch by batch and survive whatever happens."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import itertools
+import json
+import os
+import shlex
+import shutil
+import socket
+import sys
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlplan.dataset.protocol import Layout
+from wlplan.dataset.variables import LOADS, VARIABLES, Dataset
+from wlplan.errors import InputError
+from wlplan.simulator import Simulator
+
+DATASET_FORMAT = "wlplan.dataset/1"
+
+
+def identity(cycles: int, seed: int, simulator: Simulator) -> dict[str, Any]:
+    """What must agree for two collections to end with the same cycles, as JSON holds it."""
+    identity = {
+        "format": DATASET_FORMAT,
+        "cycles": cycles,
+        "seed": seed,
+        "soil": dataclasses.asdict(simulator.soil),
+        "machine": dataclasses.asdict(simulator.machine),
+        "settings": dataclasses.asdict(simulator.settings),
+        "schedule": dataclasses.asdict(simulator.schedule),
+        "loads": LOADS,
+    }
+    return json.loads(json.dumps(identity))
+
+
+def is_new(path: Path) -> bool:
+    """Whether there is nothing at a path, or an empty directory."""
+    return not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir()))
+
+
+def create(path: Path, layout: Layout, identity: Mapping[str, Any]) -> None:
+    """Makes the empty arrays beside their place and moves them there in one step."""
+    import zarr
+    from zarr.codecs import BloscCodec
+
+    beside = path.with_name(f".{path.name}.new")
+    shutil.rmtree(beside, ignore_errors=True)
+    try:
+        group = zarr.create_group(
+            store=str(beside),
+            zarr_format=3,
+            attributes={
+                **identity,
+                "title": "Loading cycles of a simulated wheel loader",
+                "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+                "versions": versions(),
+                "cycles_done": 0,
+            },
+        )
+        for name, variable in VARIABLES.items():
+            group.create_array(
+                name,
+                shape=(layout.cycles, *variable.shape),
+                chunks=(layout.batch_cycles, *variable.shape),
+                dtype=variable.dtype,
+                # Bytes of equal weight side by side compress to two thirds.
+                compressors=BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"),
+                dimension_names=("cycle", *variable.dims),
+                attributes={
+                    "long_name": variable.long_name,
+                    "units": variable.units,
+                    **variable.attributes,
+                },
+            )
+        # A copy of all metadata in the group's own: xarray looks for it and complains without. That
+        # is a convention, not yet part of the format, says the warning.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            zarr.consolidate_metadata(str(beside), zarr_format=3)
+        os.replace(beside, path)
+    except BaseException:
+        shutil.rmtree(beside, ignore_errors=True)
+        raise
+
+
+def resume(path: Path, wanted: Mapping[str, Any]) -> int:
+    """Number of cycles that a data set already holds.
+
+    Raises:
+        InputError: If it is not the data set that is wanted.
+    """
+    attributes = _read_attributes(path)
+    for name, value in wanted.items():
+        found = attributes.get(name)
+        if found != value:
+            if isinstance(value, dict) and isinstance(found, dict):
+                field = next(k for k in value if found.get(k) != value[k])
+                name, found, value = f"{name} ({field})", found.get(field), value[field]
+            raise InputError(
+                f"{path}: was begun with {name} {found!r}, not {value!r}: use the same settings to "
+                f"go on with it, or choose another place."
+            )
+    # A process that was killed while it wrote leaves files that were never finished.
+    for partial_file in path.glob("**/*.partial"):
+        partial_file.unlink(missing_ok=True)
+    return int(attributes["cycles_done"])
+
+
+def write(path: Path, batch: Mapping[str, np.ndarray], start: int) -> None:
+    """Writes a batch from cycle `start` on; `cycles_done` has to be updated afterwards."""
+    import zarr
+
+    # A chunk that is missing is then one that was lost.
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        group = zarr.open_group(str(path), mode="r+", zarr_format=3)
+        for name, values in batch.items():
+            array = group[name]
+            assert isinstance(array, zarr.Array)
+            array[start : start + len(values)] = values
+
+
+def _read_attributes(path: Path) -> dict[str, Any]:
+    """The attributes of the group of a data set.
+
+    Raises:
+        InputError: If it is missing, or not a data set of this format.
+    """
+    if not os.path.lexists(path):
+        raise InputError(f"{path}: no such data set: check the name, or collect it first.")
+    try:
+        attributes = json.loads((path / "zarr.json").read_text("utf-8"))["attributes"]
+        found = attributes.get("format")
+        if found == DATASET_FORMAT:
+            int(attributes["cycles"]), int(attributes["cycles_done"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path}: is not a data set of wlplan: name a directory that `wlplan collect` wrote."
+        ) from error
+    if found != DATASET_FORMAT:
+        raise InputError(
+            f"{path}: has format {found!r}, not {DATASET_FORMAT!r}: it is not a data set, or one "
+            f"for another version of wlplan."
+        )
+    return attributes
+
+
+def update_attributes(path: Path, changes: Mapping[str, Any]) -> None:
+    """Changes attributes of the group, all or none, after everything written so far."""
+    target = path / "zarr.json"
+    document = json.loads(target.read_text("utf-8"))
+    document["attributes"].update(changes)
+    beside = path / ".zarr.json.partial"
+    with beside.open("w", encoding="utf-8") as file:
+        json.dump(document, file, indent=2)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(beside, target)
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that decide the numbers."""
+    return {name: importlib.metadata.version(name) for name in ("wlplan", "jax", "numpy")}
+
+
+@contextlib.contextmanager
+def lock(path: Path) -> Iterator[None]:
+    """Keeps two processes from writing the same data set; a lock of a dead process is taken over.
+
+    Raises:
+        InputError: If a running process holds it.
+    """
+    lock = path.with_name(f"{path.name}.lock")
+    mine = f"{os.getpid()} {_start_of(os.getpid())} {socket.gethostname()}"
+    for attempt in itertools.count():
+        try:
+            handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+        except FileExistsError:
+            holder = ""
+            with contextlib.suppress(OSError):
+                holder = lock.read_text("utf-8")
+            if _is_alive(holder) or attempt > 2:
+                raise InputError(
+                    f"{path}: is being written by process {holder.split(' ')[0] or '?'}: wait for "
+                    f"it, or delete {lock.name} if it is gone."
+                ) from None
+            lock.unlink(missing_ok=True)
+        else:
+            break
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(mine)
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+
+
+def _is_alive(holder: str) -> bool:
+    """Whether the process that wrote a lock still runs, as far as can be told."""
+    try:
+        number, start, host = holder.split(" ", 2)
+        pid = int(number)
+    except ValueError:
+        return False
+    if host != socket.gethostname():
+        return True
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    # After a restart another process may have the same number.
+    return _start_of(pid) == start
+
+
+def _start_of(pid: int) -> str:
+    """When a process started, or that it has ended, where the system tells (Linux); else "?"."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        # A process that was killed may stay listed until its parent asks for it.
+        return "ended" if fields[0] in "ZX" else fields[19]
+    except (OSError, IndexError):
+        return "?"
+
+
+def open_dataset(path: str | os.PathLike[str]) -> Dataset:
+    """Reads a complete data set into memory, 27 kB a cycle.
+
+    Raises:
+        InputError: If it is missing, not complete, damaged, or of another format.
+    """
+    import zarr
+
+    path = Path(path)
+    attributes = _read_attributes(path)
+    cycles, done = int(attributes["cycles"]), int(attributes["cycles_done"])
+    if done < cycles:
+        raise InputError(
+            f"{path}: holds {done} of {cycles} cycles: run the same `wlplan collect` again to "
+            f"finish it."
+        )
+    columns: dict[str, Any] = {}
+    try:
+        group = zarr.open_group(str(path), mode="r", zarr_format=3)
+        for name, variable in VARIABLES.items():
+            array = group[name]
+            if not isinstance(array, zarr.Array) or array.nchunks_initialized < array.nchunks:
+                raise ValueError(f"parts of {name} are missing")
+            columns[name] = np.asarray(array[...])
+            if columns[name].shape != (cycles, *variable.shape):
+                raise ValueError(f"{name} has shape {columns[name].shape}")
+    except Exception as error:
+        # Damaged chunks make the decoders raise almost anything; to the user it means the same.
+        what = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{path}: is damaged ({what}): copy or collect it again.") from error
+    return Dataset(**columns, attributes=attributes)
