@@ -1,5 +1,6 @@
 """The command line: results on stdout, one line on stderr for whatever is wrong, whole files."""
 
+import dataclasses
 import json
 import math
 import os
@@ -16,7 +17,7 @@ from matplotlib.figure import Figure
 from wlplan import cli, dataset, io, objective, planner, plots, report, worlds
 from wlplan.diggability import edge_poses
 from wlplan.errors import InputError
-from wlplan.machine import GRAVEL
+from wlplan.machine import GRAVEL, SAND, WA320
 from wlplan.pile import seed_pile, toe_contour
 from wlplan.planner import PlanResult
 from wlplan.types import Action, LoadingPlan, Performance, Pose, Rollout
@@ -27,10 +28,8 @@ FILES = ["plan.json", "plan.png", "report.html", "totals.png"]
 class FakeWorld:
     """A world of simple numbers; `fake_play` says what a whole plan does in it."""
 
-    soil = GRAVEL
-
-    def __init__(self, factor):
-        self.factor = factor
+    def __init__(self, factor, soil=GRAVEL):
+        self.factor, self.soil = factor, soil
 
     def __call__(self, pile, pose, action):
         """The pile as it was."""
@@ -43,7 +42,7 @@ def fake_play(world, pile, plan, *, objective="efficiency", receiver=None):
     count = len(plan.pose.x)
     mass = jnp.asarray(world.factor * np.linspace(1.0, 3.0, count), jnp.float32)
     height = np.asarray(pile.height, np.float64)
-    lost = float(mass.sum()) / (GRAVEL.density / 1000.0) / pile.cell_size**2
+    lost = float(mass.sum()) / (world.soil.density / 1000.0) / pile.cell_size**2
     after = pile.replace(height=jnp.asarray(height - lost * height / height.sum(), jnp.float32))
     performance = Performance(mass, jnp.full(count, 10.0), jnp.full(count, 300.0))
     return PlanResult(
@@ -63,12 +62,18 @@ def calls():
 
 
 @pytest.fixture
+def asked():
+    """Worlds that were asked for: name, soil, machine."""
+    return []
+
+
+@pytest.fixture
 def real_figures():
     """Asked for by the tests that want them."""
 
 
 @pytest.fixture(autouse=True)
-def fakes(monkeypatch, calls, request):
+def fakes(monkeypatch, calls, asked, request):
     """Stand-ins for what takes long; the pile and the files are real."""
 
     def plan_loads(world, pile, *, loads, progress, **options):
@@ -82,10 +87,11 @@ def fakes(monkeypatch, calls, request):
             progress("steps", done + 1, loads, 3.0)
         return fake_play(world, pile, plan)
 
-    def load_world(name, *, model=None):
+    def load_world(name, *, model=None, soil=GRAVEL, machine=WA320):
+        asked.append((name, soil, machine))
         if name in ("high", "hybrid"):
             raise InputError(f"the {name} world\nis not there yet; use low")
-        return FakeWorld(1.0 if name == "simulator" else 1.1)
+        return FakeWorld(1.0 if name == "simulator" else 1.1, soil)
 
     monkeypatch.setattr(planner, "plan_loads", plan_loads)
     monkeypatch.setattr(planner, "play", fake_play)
@@ -355,6 +361,98 @@ def test_a_map_is_written(run, scan, tmp_path, monkeypatch, real_figures):
     assert len(document["locations"]) == 20
     assert {load["time"] for load in document["locations"]} == {12.0}
     assert strict_json(run(*words, "--json")[1]) == document
+
+
+# --- soil and machine
+
+
+def test_the_soil_of_the_options_is_in_every_world_and_the_ledger(run, scan, asked):
+    code, out, err = run("plan", scan, "--loads", 1, "--soil", "sand", "--json")
+    assert code == 0
+    assert asked == [("low", SAND, WA320), ("simulator", SAND, WA320)]
+    document = strict_json(out)
+    assert document["ledger"]["density"] == pytest.approx(SAND.density / 1000.0)
+    assert document["soil"] == {"name": "sand", "parameters": dataclasses.asdict(SAND)}
+    assert document["machine"] == {"name": "wa320", "parameters": dataclasses.asdict(WA320)}
+    assert err.count("note: ") == 1
+    assert "trained for gravel and the WA320, not for sand:" in err
+
+
+def test_a_plan_is_played_with_its_own_soil_and_machine(run, scan, asked, tmp_path):
+    given = tmp_path / "narrow.toml"
+    given.write_text("bucket_width = 2.0\ntilt_speed_deg = 30\n")
+    narrow = dataclasses.replace(WA320, bucket_width=2.0, tilt_speed=math.radians(30.0))
+    words = ("--soil", "sand", "--machine", given, "--out", tmp_path / "out")
+    assert run("plan", scan, "--loads", 1, *words)[0] == 0
+    given.unlink()  # the plan holds all values
+    path = tmp_path / "out" / "plan.json"
+    asked.clear()
+    code, out, err = run("simulate", scan, path, "--json")
+    assert code == 0
+    assert "another soil" not in err
+    assert asked == [("simulator", SAND, narrow)]
+    again, planned = strict_json(out), json.loads(path.read_text())
+    for part in ("soil", "machine", "ledger"):
+        assert again[part] == planned[part]
+    _, out, err = run("simulate", scan, path, "--soil", "gravel", "--json")
+    assert asked[1:] == [("simulator", GRAVEL, narrow)]
+    assert "another soil" in err
+    assert json.loads(out)["ledger"]["density"] == pytest.approx(GRAVEL.density / 1000.0)
+
+
+def test_without_options_it_is_gravel_and_the_wa320_and_nothing_is_told(run, scan, asked):
+    _, out, err = run("plan", scan, "--loads", 1, "--json")
+    assert {entry[1:] for entry in asked} == {(GRAVEL, WA320)}
+    assert "note" not in err
+    assert json.loads(out)["soil"]["name"] == "gravel"
+    # The simulator was trained for nothing.
+    assert (
+        "note" not in run("plan", scan, "--loads", 1, "--world", "simulator", "--soil", "clay")[2]
+    )
+
+
+@pytest.mark.parametrize(
+    ("record", "word"),
+    [
+        ("sand", "soil has no name"),
+        ({"name": "sand"}, "no parameters"),
+        ({"name": "sand", "parameters": {"density": -1.0}}, "density is -1"),
+        ({"name": "sand", "parameters": {"densty": 1.0}}, "densty"),
+    ],
+)
+def test_a_plan_with_a_soil_that_cannot_be_is_refused(run, scan, tmp_path, record, word):
+    run("plan", scan, "--loads", 1, "--out", tmp_path / "out")
+    path = tmp_path / "out" / "plan.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "soil": record}))
+    refused(run("simulate", scan, path), str(path), word)
+
+
+def test_a_map_has_its_soil_and_machine(run, scan, asked):
+    code, out, err = run("diggability", scan, "--locations", 3, "--soil", "clay", "--json")
+    assert code == 0
+    assert "trained for gravel" in err
+    assert asked[0][1].cohesion > 0.0
+    assert json.loads(out)["soil"]["name"] == "clay"
+
+
+@pytest.mark.parametrize("command", ["plan", "simulate", "diggability", "gradcheck"])
+@pytest.mark.parametrize(
+    ("option", "text", "told"),
+    [
+        ("--soil", "density = -1", "density is -1 kg/m³"),
+        ("--soil", "friction_deg = 95", "friction_deg is 95°"),
+        ("--machine", "bucket_width = 6", "bucket_width is 6 m"),
+        ("--machine", "mass = nan", "mass is not finite"),
+    ],
+)
+def test_a_soil_or_machine_that_cannot_be_is_one_line(
+    run, tmp_path, asked, command, option, text, told
+):
+    (tmp_path / "given.toml").write_text(text)
+    piles = ("bundled", "plan.json") if command == "simulate" else ("bundled",)
+    refused(run(command, *piles, option, tmp_path / "given.toml"), "given.toml", told)
+    refused(run(command, *piles, option, "moon"), "'moon'", "no such")
+    assert asked == []
 
 
 # --- errors

@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "wlplan"
 # From the bottom to the top: a module imports only from what stands before it.
 LAYERS = [
     *("errors", "types", "units", "compilation"),
-    *("machine",),
+    *("machine", "presets"),
     *("ground", "pile"),
     *("heightmap", "characteristics"),
     *("automaton.neighbours", "automaton.slopes", "automaton.windows", "automaton.flow"),
@@ -28,7 +28,7 @@ LAYERS = [
     *("diggability", "gradcheck", "io.files", "io.plans", "io.scans", "io", "plots", "report"),
     *("bench.timing", "bench.digs", "bench.baselines", "bench.setup", "bench.automata"),
     *("bench.rollouts", "bench.planning", "bench.items", "bench"),
-    *("cli.options", "cli.inputs", "cli.outputs", "cli.progress", "cli.played"),
+    *("cli.options", "cli.outputs", "cli.inputs", "cli.progress", "cli.played"),
     *("cli.planning", "cli.maps", "cli.gradients", "cli.learning", "cli.benchmark"),
     *("cli", "__main__"),
 ]

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from wlplan.planner import PlanResult as PlanResult
     from wlplan.planner import plan_loads as plan_loads
     from wlplan.planner import play as play
+    from wlplan.presets import machine_named as machine_named
+    from wlplan.presets import soil_named as soil_named
     from wlplan.simulator import Simulator as Simulator
     from wlplan.transport import Receiver as Receiver
     from wlplan.types import Action as Action
@@ -57,6 +59,7 @@ _MODULES = {
     "objective": ("OBJECTIVES", "Objective"),
     "pile": ("seed_pile", "toe_contour"),
     "planner": ("PlanResult", "plan_loads", "play"),
+    "presets": ("machine_named", "soil_named"),
     "simulator": ("Simulator",),
     "transport": ("Receiver",),
     "types": (

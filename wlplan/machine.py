@@ -101,9 +101,57 @@ class Soil:
 
     @property
     def repose_angle(self) -> float:
-        """Angle of repose [rad]; of a cohesionless soil it is the internal friction angle."""
+        """Angle of repose [rad]: the internal friction angle.
+
+        Of a loose soil without cohesion that is what it is. A cohesive soil stands steeper than
+        this, up to a vertical face of some height, and breaks off in lumps: for such a soil the
+        angle is unsound and makes piles flatter than they are. The automaton knows nothing else.
+        """
         return self.friction
 
 
 WA320 = WheelLoader()
 GRAVEL = Soil()
+
+# The further soils are loose, as they lie in a heap after digging. Their fitted group is that of
+# gravel: nothing was fitted for them. Densities: the middle of what published tables of loose
+# materials for choosing buckets and trucks give. Internal friction: typical textbook range.
+
+# Dry sand. Density 1.4 to 1.6 t/m^3, friction 28 to 34 degrees, no cohesion. On steel: estimate,
+# two thirds of the internal friction.
+SAND = Soil(
+    density=1500.0,
+    friction=math.radians(31.0),
+    cohesion=0.0,
+    steel_friction=math.radians(20.0),
+    adhesion=0.0,
+)
+# Wet sand. Density 1.8 to 1.95 t/m^3; friction as when dry. Cohesion from the water between the
+# grains, which goes when the sand dries or floods: estimate, 1 to 4 kPa. On steel: as for dry sand.
+WET_SAND = Soil(
+    density=1850.0,
+    friction=math.radians(31.0),
+    cohesion=2_000.0,
+    steel_friction=math.radians(20.0),
+    adhesion=0.0,
+)
+# Moist earth, sandy loam. Density 1.25 to 1.6 t/m^3, friction 25 to 35 degrees, on steel 20 to 22.
+# Cohesion: 5 to 15 kPa in place (typical textbook range), less once dug: estimate. Adhesion: taken
+# as none, as textbooks do for soil that is not sticky.
+DIRT = Soil(
+    density=1450.0,
+    friction=math.radians(30.0),
+    cohesion=4_000.0,
+    steel_friction=math.radians(21.0),
+    adhesion=0.0,
+)
+# Moist clay in lumps. Density 1.5 to 1.7 t/m^3, friction 10 to 25 degrees, on steel 0.5 to 0.7 of
+# it. Cohesion: 10 to 40 kPa in place (typical textbook range), less once dug: estimate. Adhesion:
+# estimate, a quarter of the cohesion.
+CLAY = Soil(
+    density=1600.0,
+    friction=math.radians(20.0),
+    cohesion=8_000.0,
+    steel_friction=math.radians(13.0),
+    adhesion=2_000.0,
+)

@@ -135,7 +135,8 @@ for the boom (bm) and the bucket (bk).</li>
 
 _NOTES = """<ul>
 <li>The models were trained on, and the plan was checked in, this package's own simulator of a wheel
-loader of the WA320 class in dry gravel. It is not a measurement on a machine.</li>
+loader; it was fitted to dry gravel and a loader of the WA320 class, whatever the soil and the
+machine under Settings are. It is not a measurement on a machine.</li>
 <li>The transport is an estimate from the length of a V-turn at constant speed. Obstacles, the
 pile among them, are not looked at: check that the way to the truck is free.</li>
 <li>Cells that the scan did not see, hatched in the maps, are filled in from their surroundings: a
@@ -281,6 +282,11 @@ def _settings(document: Mapping[str, Any], more: Mapping[str, str]) -> str:
         (name, _text(document[name]))
         for name in ("world", "model", "planner", "objective", "seed")
         if name in document
+    ]
+    rows += [
+        (part, _text(document[part].get("name", "unnamed")))
+        for part in ("soil", "machine")
+        if isinstance(document.get(part), Mapping)
     ]
     if receiver:
         place = f"x {_number(receiver.get('x'))} m, y {_number(receiver.get('y'))} m"

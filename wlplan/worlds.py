@@ -15,6 +15,7 @@ from wlplan.excavation import excavate
 from wlplan.heightmap import sample_local
 from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
 from wlplan.models.performance import PerformanceModel
+from wlplan.presets import check_machine, check_soil
 from wlplan.simulator import Simulator
 from wlplan.training import load_model
 from wlplan.types import Action, Performance, Pile, Pose, World, action_vector
@@ -56,21 +57,34 @@ def pretrained_path(name: str) -> Path:
     return Path(str(resources.files("wlplan") / "pretrained" / name))
 
 
-def load_world(name: str, *, model: str | Path | None = None) -> World:
+def load_world(
+    name: str,
+    *,
+    model: str | Path | None = None,
+    soil: Soil = GRAVEL,
+    machine: WheelLoader = WA320,
+) -> World:
     """A world by name.
 
     Args:
         name: "low" (ψ_low and the automaton) or "simulator"; "high" and "hybrid" need models that
             are not part of the package yet.
         model: Directory of a trained model to use in place of the pretrained one.
+        soil: What is dug. A learned world takes from it the density, by which it turns mass into
+            volume, and the angle of repose; what it predicts is for the soil of its training.
+        machine: What digs. A learned world takes from it the width of the bucket.
 
     Raises:
-        InputError: If the name is unknown, or a model is missing or unusable.
+        InputError: If the name is unknown, a model is missing or unusable, or soil or machine make
+            no sense.
     """
+    check_soil(soil)
+    check_machine(machine)
     if name == "simulator":
-        return Simulator()
+        return Simulator(machine=machine, soil=soil)
     if name == "low":
-        return LowWorld(load_model(pretrained_path("psi_low") if model is None else Path(model)))
+        directory = pretrained_path("psi_low") if model is None else Path(model)
+        return LowWorld(load_model(directory), machine=machine, soil=soil)
     if name in WORLDS:
         raise InputError(
             f"the {name} world needs ψ_high, which is not trained yet; use low or simulator"

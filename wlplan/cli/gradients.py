@@ -12,6 +12,7 @@ from wlplan.cli.inputs import (
     pile_named,
     receiver_at,
     receiver_fields,
+    site_named,
     world_named,
 )
 from wlplan.cli.options import (
@@ -20,6 +21,7 @@ from wlplan.cli.options import (
     objective_option,
     out_option,
     pile_argument,
+    site_options,
     with_options,
     world_option,
 )
@@ -61,6 +63,7 @@ _VERDICTS = {"ok": ("ok", None), "kink": ("kink", "yellow"), "wrong": ("WRONG", 
         help="Relative error above which a component counts as wrong. Default: 1e-4; in the "
         "simulator, where the derivative of the earthmoving force is approximate, 3e-3.",
     ),
+    *site_options(),
     model_option,
     out_option,
 )
@@ -71,6 +74,8 @@ def gradcheck(
     objective: str,
     step: float,
     tolerance: float | None,
+    soil: str | None,
+    machine: str | None,
     model: str | None,
     out: str | None,
     seed: int,
@@ -84,6 +89,7 @@ def gradcheck(
     """
     check_pile_name(pile_file)
     check_model(model, world_name)
+    site = site_named(soil, machine)
     in_simulator = world_name == "simulator"
     if in_simulator and loads > _MOST_LOADS_SIMULATOR:
         raise InputError(
@@ -100,7 +106,7 @@ def gradcheck(
     if tolerance is None:
         tolerance = SIMULATOR_TOLERANCE if in_simulator else TOLERANCE
     pile, source = pile_named(pile_file)
-    world, receiver = world_named(world_name, model), receiver_at(pile, None)
+    world, receiver = world_named(world_name, site, model), receiver_at(pile, None)
     checked_plan = random_plan(pile, loads, seed=seed)
     with Progress() as progress, Stopwatch() as checking:
         check = check_gradient(
@@ -114,6 +120,7 @@ def gradcheck(
     document = {
         "format": _FORMAT,
         "pile": source,
+        **site.fields(),
         "world": world_name,
         **({} if model is None else {"model": model}),
         "objective": objective,

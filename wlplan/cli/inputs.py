@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wlplan.cli.options import BUNDLED
+from wlplan.cli.outputs import remark
 from wlplan.errors import InputError
+from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
+from wlplan.presets import (
+    MACHINES,
+    SOILS,
+    machine_named,
+    machine_recorded,
+    soil_named,
+    soil_recorded,
+)
 
 if TYPE_CHECKING:
     from jaxtyping import Array
@@ -26,6 +37,23 @@ RECEIVER_FIELDS = ("x", "y", "heading")
 
 # Farthest that a truck may stand from the middle of the map [m].
 _FARTHEST_TRUCK = 500.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Site:
+    """What is dug and what digs, each with the name that it goes by."""
+
+    soil_name: str = "gravel"
+    soil: Soil = GRAVEL
+    machine_name: str = "wa320"
+    machine: WheelLoader = WA320
+
+    def fields(self) -> dict[str, Any]:
+        """What plan.json and the like say about it: names, and all values in SI units."""
+        return {
+            "soil": {"name": self.soil_name, "parameters": dataclasses.asdict(self.soil)},
+            "machine": {"name": self.machine_name, "parameters": dataclasses.asdict(self.machine)},
+        }
 
 
 def check_pile_name(name: str) -> None:
@@ -101,11 +129,114 @@ def pile_named(name: str) -> tuple[Pile, dict[str, Any]]:
     return pile, fields
 
 
-def world_named(name: str, model: str | None = None) -> World:
-    """A world of `WORLDS`, with the model that ships with the package or one from a folder."""
+def site_named(soil: str | None, machine: str | None, *, otherwise: Site = Site()) -> Site:
+    """The soil and the machine of the options.
+
+    Args:
+        soil: Name of a preset or of a TOML file, None if the option is not given.
+        machine: Likewise.
+        otherwise: What counts where an option is not given.
+
+    Raises:
+        InputError: If one of them is unknown or makes no sense.
+    """
+    site = otherwise
+    if soil is not None:
+        site = dataclasses.replace(site, soil_name=soil, soil=soil_named(soil))
+    if machine is not None:
+        site = dataclasses.replace(site, machine_name=machine, machine=machine_named(machine))
+    return site
+
+
+def site_recorded(document: Mapping[str, Any], file: str) -> Site:
+    """The soil and the machine that a document recorded; the presets where it has none.
+
+    Args:
+        document: Content of a plan.json.
+        file: Its name, for complaints.
+
+    Raises:
+        InputError: If what it says about them cannot be used.
+    """
+    try:
+        site = Site()
+        if "soil" in document:
+            name, parameters = _record(document, "soil")
+            site = dataclasses.replace(site, soil_name=name, soil=soil_recorded(parameters))
+        if "machine" in document:
+            name, parameters = _record(document, "machine")
+            machine = machine_recorded(parameters)
+            site = dataclasses.replace(site, machine_name=name, machine=machine)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    return site
+
+
+def _record(document: Mapping[str, Any], part: str) -> tuple[str, object]:
+    """Name and parameters of what a document recorded."""
+    record = document[part]
+    if not isinstance(record, dict) or not isinstance(record.get("name"), str):
+        raise InputError(f"{part} has no name: write the plan again.")
+    return record["name"], record.get("parameters")
+
+
+def world_named(name: str, site: Site, model: str | None = None) -> World:
+    """A world of `WORLDS` at a site.
+
+    Tells on stderr if it is learned and its model was trained for another site.
+
+    Args:
+        name: Name of the world.
+        site: What is dug and what digs.
+        model: Folder of a model in place of the one that ships with the package.
+    """
     from wlplan.worlds import load_world
 
-    return load_world(name) if model is None else load_world(name, model=model)
+    world = load_world(name, model=model, soil=site.soil, machine=site.machine)
+    if name == "low":
+        _remark_on_training(model, site)
+    return world
+
+
+def _remark_on_training(model: str | None, site: Site) -> None:
+    """Tell if a model was trained for another soil or machine than those of a site."""
+    from wlplan.training import read_description
+    from wlplan.worlds import pretrained_path
+
+    folder = pretrained_path("psi_low") if model is None else Path(model)
+    data = read_description(folder).get("dataset")
+    data = data if isinstance(data, dict) else {}
+    trained = {part: data.get(part) for part in ("soil", "machine")}
+    # A description may say nothing of them: data of one's own do not have to.
+    others = [
+        name
+        for part, name, values in (
+            ("soil", site.soil_name, site.soil),
+            ("machine", site.machine_name, site.machine),
+        )
+        if isinstance(trained[part], dict) and not _agree(trained[part], values)
+    ]
+    if others:
+        soil = _name_among(SOILS, trained["soil"], "another soil")
+        machine = _name_among(MACHINES, trained["machine"], "another machine")
+        machine = f"the {machine.upper()}" if machine in MACHINES else machine
+        remark(
+            f"the model was trained for {soil} and {machine}, not for {' and '.join(others)}: "
+            f"what it predicts is for those"
+        )
+
+
+def _name_among(presets: Mapping[str, Any], recorded: Any, otherwise: str) -> str:
+    """Name of the preset that has recorded values."""
+    found = (name for name, preset in presets.items() if _agree(recorded, preset))
+    return next(found, otherwise)
+
+
+def _agree(recorded: Any, values: Soil | WheelLoader) -> bool:
+    """Whether recorded values are those; a field that was not recorded had no say yet."""
+    return isinstance(recorded, dict) and all(
+        recorded.get(name, value) == value for name, value in dataclasses.asdict(values).items()
+    )
 
 
 def receiver_at(pile: Pile, truck: tuple[float, ...] | None) -> Receiver:

@@ -7,12 +7,13 @@ import math
 
 import click
 
-from wlplan.cli.inputs import check_model, check_pile_name, pile_named, world_named
+from wlplan.cli.inputs import check_model, check_pile_name, pile_named, site_named, world_named
 from wlplan.cli.options import (
     ActionNumbers,
     model_option,
     out_option,
     pile_argument,
+    site_options,
     with_options,
     world_option,
 )
@@ -48,6 +49,7 @@ _MOST_LOCATIONS = 10_000
         help="Parameters of the bucket-filling controller, the same everywhere.",
     ),
     world_option,
+    *site_options(),
     model_option,
     out_option,
 )
@@ -56,6 +58,8 @@ def diggability(
     locations: int,
     action: tuple[float, ...],
     world_name: str,
+    soil: str | None,
+    machine: str | None,
     model: str | None,
     out: str | None,
     seed: int,
@@ -67,6 +71,7 @@ def diggability(
     """
     check_pile_name(pile_file)
     check_model(model, world_name)
+    site = site_named(soil, machine)
     folder = None if out is None else checked_folder(out)
 
     import numpy as np
@@ -75,7 +80,7 @@ def diggability(
     from wlplan.types import Action
 
     pile, source = pile_named(pile_file)
-    world = world_named(world_name, model)
+    world = world_named(world_name, site, model)
     fixed = Action(*action)  # type: ignore[arg-type]
     with Progress() as progress, Stopwatch() as mapping:
         progress("diggability", 0, 1, None)
@@ -99,6 +104,7 @@ def diggability(
     document = {
         "format": _FORMAT,
         "pile": source,
+        **site.fields(),
         "world": world_name,
         **({} if model is None else {"model": model}),
         "action": dict(zip(names, action, strict=True)),

@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from wlplan.presets import MACHINES, SOILS
 from wlplan.units import ACTION_HIGH, ACTION_LOW
 
 # Names that the modules behind define, repeated here to keep help fast; a test compares them.
@@ -118,6 +119,30 @@ def objective_option(purpose: str) -> Callable[[Any], Any]:
         default=OBJECTIVES[0],
         show_default=True,
         help=purpose,
+    )
+
+
+def site_options(default: str = "") -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """The options that say what is dug and what digs.
+
+    Args:
+        default: What is taken without them, in words; by default gravel and the WA320.
+    """
+    soil, machine = (default, default) if default else ("gravel", "wa320")
+    return (
+        click.option(
+            "--soil",
+            metavar="NAME|FILE.toml",
+            default=None,
+            help=f"Soil: {', '.join(SOILS)}, or a TOML file of parameters. Default: {soil}.",
+        ),
+        click.option(
+            "--machine",
+            metavar="NAME|FILE.toml",
+            default=None,
+            help=f"Machine: {', '.join(MACHINES)}, or a TOML file of parameters. "
+            f"Default: {machine}.",
+        ),
     )
 
 

@@ -16,6 +16,8 @@ from wlplan.cli.inputs import (
     pile_named,
     receiver_at,
     receiver_fields,
+    site_named,
+    site_recorded,
     world_named,
 )
 from wlplan.cli.options import (
@@ -26,6 +28,7 @@ from wlplan.cli.options import (
     objective_option,
     out_option,
     pile_argument,
+    site_options,
     truck_option,
     with_options,
     world_option,
@@ -60,6 +63,7 @@ _ORIGIN_FIELDS = ("world", "model", "planner", "seed")
         help="Let the simulator pick among the planner's best plans.",
     ),
     truck_option,
+    *site_options(),
     model_option,
     out_option,
 )
@@ -71,6 +75,8 @@ def plan(
     objective: str,
     referee: bool,
     truck: tuple[float, ...] | None,
+    soil: str | None,
+    machine: str | None,
     model: str | None,
     out: str | None,
     seed: int,
@@ -82,6 +88,7 @@ def plan(
     """
     check_pile_name(pile_file)
     check_model(model, world_name)
+    site = site_named(soil, machine)
     folder = None if out is None else checked_folder(out)
 
     from wlplan.io import plan_to_dict
@@ -89,7 +96,7 @@ def plan(
 
     pile, source = pile_named(pile_file)
     receiver = receiver_at(pile, truck)
-    world, simulator = world_named(world_name, model), world_named("simulator")
+    world, simulator = world_named(world_name, site, model), world_named("simulator", site)
     with Progress() as progress:
         with Stopwatch() as planning:
             planned = ready(
@@ -123,6 +130,7 @@ def plan(
         simulated=simulated.rollout.performance,
         transport={"time": planned.transport_time, "work": planned.transport_work},
         pile=source,
+        **site.fields(),
         world=world_name,
         planner=planner,
         objective=objective,
@@ -199,16 +207,23 @@ def _write_plan(
 @click.command()
 @click.argument("pile_file", metavar="PILE")
 @click.argument("plan_file", metavar="PLAN.json")
-@with_options(truck_option)
+@with_options(truck_option, *site_options("that of the plan"))
 def simulate(
-    pile_file: str, plan_file: str, truck: tuple[float, ...] | None, seed: int, as_json: bool
+    pile_file: str,
+    plan_file: str,
+    truck: tuple[float, ...] | None,
+    soil: str | None,
+    machine: str | None,
+    seed: int,
+    as_json: bool,
 ) -> None:
     """Play PLAN.json in the simulator on PILE and compare with what was predicted.
 
-    The truck is that of the plan, unless --truck is given. The simulator has no randomness, so
+    Truck, soil and machine are those of the plan, unless given. The simulator has no randomness, so
     --seed changes nothing.
     """
     check_pile_name(pile_file)
+    site_named(soil, machine)  # wrong options are refused before anything heavy is imported
 
     from wlplan.io import plan_to_dict, read_plan
     from wlplan.planner import play
@@ -218,12 +233,16 @@ def simulate(
     made_for = given.get("pile")
     if isinstance(made_for, dict) and made_for.get("sha256", source["sha256"]) != source["sha256"]:
         remark("the plan was made for another pile file than this one")
+    recorded = site_recorded(given, plan_file)
+    site = site_named(soil, machine, otherwise=recorded)
+    if (site.soil, site.machine) != (recorded.soil, recorded.machine):
+        remark("the plan was made for another soil or machine than it is played with")
     objective = given.get("objective")
     objective = objective if objective in OBJECTIVES else OBJECTIVES[0]
     receiver = receiver_at(pile, truck if truck is not None else _truck_of(given))
     with Progress() as progress, Stopwatch() as playing:
         progress("simulator", 0, 1, None)
-        simulator = world_named("simulator")
+        simulator = world_named("simulator", site)
         played = ready(play(simulator, pile, loading_plan, objective=objective, receiver=receiver))
         progress("simulator", 1, 1, None)
 
@@ -240,6 +259,7 @@ def simulate(
         simulated=played.rollout.performance,
         transport={"time": played.transport_time, "work": played.transport_work},
         pile=source,
+        **site.fields(),
         **{name: given[name] for name in _ORIGIN_FIELDS if name in given},
         objective=objective,
         receiver=receiver_fields(receiver),
