@@ -2,22 +2,33 @@
 
 import dataclasses
 import errno
+import functools
+import itertools
 import json
 import math
 import os
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 import threading
+import time
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import zarr
 
+from wlplan import cli
 from wlplan.dataset import (
     VARIABLES,
     Dataset,
     collect,
     fingerprint,
+    merge,
+    merging,
     open_dataset,
     protocol,
     reflect,
@@ -37,6 +48,8 @@ from wlplan.types import Pile, Pose
 from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE
 
 CYCLES, SEED = 11, 5
+# Three batches.
+LONGER = 17
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -73,6 +86,38 @@ def copy(store, tmp_path):
 def contents(path):
     """Every file of a store by name."""
     return {p.relative_to(path): p.read_bytes() for p in path.rglob("*") if p.is_file()}
+
+
+def contents_but_command(path):
+    """`contents`, without the words that the processes were started with."""
+    found = contents(path)
+    document = json.loads(found.pop(Path("zarr.json")))
+    del document["attributes"]["command"]
+    return found, json.dumps(document)
+
+
+@pytest.fixture(scope="module")
+def longer(tmp_path_factory):
+    path = tmp_path_factory.mktemp("longer") / "data.zarr"
+    collect(path, cycles=LONGER, seed=SEED)
+    return path
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory):
+    """Number of shards -> all of them."""
+    folder = tmp_path_factory.mktemp("shards")
+    made = {n: [folder / f"{i}-of-{n}.zarr" for i in range(1, n + 1)] for n in (2, 3)}
+    for n, paths in made.items():
+        for i, path in enumerate(paths, 1):
+            collect(path, cycles=LONGER, seed=SEED, shard=(i, n))
+    return made
+
+
+@pytest.fixture
+def parts(shards, tmp_path):
+    """Three shards to spoil."""
+    return [shutil.copytree(path, tmp_path / "parts" / path.name) for path in shards[3]]
 
 
 def numbered(rollouts, loads=3):
@@ -348,9 +393,333 @@ def test_other_things_are_not_overwritten(tmp_path):
     refused(lambda: collect(tmp_path, cycles=3), "not a data set")
     refused(lambda: collect(tmp_path / "note.txt", cycles=3), "not a data set")
     refused(lambda: collect(tmp_path / "note.txt" / "data.zarr", cycles=3), "cannot be written")
+    refused(lambda: collect("/", cycles=3), "name a folder")
     refused(lambda: collect(tmp_path / "missing" / "data.zarr", cycles=0), "at least 1")
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
     assert (tmp_path / "note.txt").read_text() == "keep me"
+
+
+# --- shards
+
+
+@pytest.mark.parametrize("cycles", [1, 1799, 1801, 10_800, 108_001, 1_000_000])
+def test_the_shards_are_even_portions_of_whole_batches(cycles, monkeypatch):
+    for name, value in (("LOADS", 30), ("_BATCH", 60)):
+        monkeypatch.setattr(protocol, name, value)
+    batches = Layout(cycles).batches
+    for count in {1, min(2, batches), min(7, batches), batches}:
+        parts = [Layout(cycles, (number, count)) for number in range(1, count + 1)]
+        assert parts[0].first == 0
+        assert parts[-1].stop == cycles
+        assert all(one.stop == other.first for one, other in itertools.pairwise(parts))
+        assert all(part.first % part.batch_cycles == 0 for part in parts)
+        held = [math.ceil(part.size / part.batch_cycles) for part in parts]
+        assert 1 <= min(held) <= max(held) <= min(held) + 1
+
+
+@pytest.mark.parametrize(("number", "count"), [(0, 3), (4, 3), (-1, 3), (1, 0)])
+def test_there_are_no_other_shards_than_those(tmp_path, number, count):
+    call = functools.partial(collect, tmp_path / "x.zarr", cycles=LONGER)
+    refused(lambda: call(shard=(number, count)), f"no shard {number}/{count}")
+    assert not any(tmp_path.iterdir())
+
+
+def test_more_shards_than_batches_are_refused(tmp_path):
+    call = functools.partial(collect, tmp_path / "x.zarr", cycles=LONGER)
+    refused(lambda: call(shard=(1, 4)), "at most 3", "6 cycles")
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0), (0, 1, 2), (2, 0, 1)])
+def test_merged_shards_are_the_bytes_of_a_single_collector(longer, shards, tmp_path, order):
+    paths = [shards[len(order)][i] for i in order]
+    before = [contents(path) for path in paths]
+    seen = []
+    out = tmp_path / "not" / "yet" / "data.zarr"
+    attributes = merge(paths, out, progress=lambda *numbers: seen.append(numbers))
+    assert contents(out) == contents(longer)
+    assert attributes == dict(open_dataset(out).attributes)
+    assert [contents(path) for path in paths] == before
+    assert seen == [(0, LONGER), (6, LONGER), (12, LONGER), (17, LONGER)]
+    assert [entry.name for entry in out.parent.iterdir()] == ["data.zarr"]
+
+
+def test_a_shard_says_what_it_is_and_is_not_taken_for_the_whole(shards, longer):
+    path = shards[2][1]
+    attributes = json.loads((path / "zarr.json").read_text())["attributes"]
+    assert {name: attributes[name] for name in stored.SHARD_ATTRIBUTES} == {
+        "shard": 2,
+        "shards": 2,
+        "first_cycle": 6,
+        "whole_cycles": LONGER,
+    }
+    assert attributes["cycles"] == attributes["cycles_done"] == 11
+    refused(lambda: open_dataset(path), "shard 2/2", "--merge")
+    # To others it is a zarr group like any other.
+    whole = open_dataset(longer)
+    for name in VARIABLES:
+        np.testing.assert_array_equal(zarr.open_array(path / name)[:], getattr(whole, name)[6:])
+
+
+@pytest.mark.parametrize("after", [0, 4, 9])
+def test_a_shard_that_was_cut_short_ends_with_the_same_bytes(shards, tmp_path, after):
+    call = functools.partial(collect, tmp_path / "x.zarr", cycles=LONGER, seed=SEED, shard=(2, 2))
+    seen = []
+
+    def stop(done, total):
+        seen.append((done, total))
+        if done >= after:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        call(progress=stop)
+    assert seen[0] == (0, 11)
+    refused(lambda: merge([shards[2][0], tmp_path / "x.zarr"], tmp_path / "y"), "of the 11 cycles")
+    call()
+    assert contents(tmp_path / "x.zarr") == contents(shards[2][1])
+
+
+@pytest.mark.parametrize(
+    ("changed", "word"),
+    [
+        ({"shard": (2, 3)}, "shard 1/3, not as shard 2/3"),
+        ({"shard": (1, 2)}, "shard 1/3, not as shard 1/2"),
+        ({"shard": None, "cycles": 6}, "shard 1/3, not as a whole data set"),
+        ({"cycles": 18}, "whole_cycles 17, not 18"),
+        ({"seed": 6}, "seed"),
+    ],
+)
+def test_another_collection_does_not_go_on_in_the_place_of_a_shard(parts, changed, word):
+    before = contents(parts[0])
+    wanted = {"cycles": LONGER, "seed": SEED, "shard": (1, 3), **changed}
+    refused(lambda: collect(parts[0], **wanted), word)
+    assert contents(parts[0]) == before
+
+
+def test_a_whole_data_set_does_not_go_on_as_a_shard(copy):
+    refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, shard=(1, 1)), "a whole data set")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"seed": 6}, ("has seed 6", "has 5")),
+        ({"versions": {"wlplan": "0.0.9"}}, ("versions (",)),
+        ({"soil": {**dataclasses.asdict(GRAVEL), "density": 1.0}}, ("soil (density) 1.0",)),
+        ({"settings": {}}, ("settings (step) None",)),
+        ({"cycles_done": 0}, ("0 of the 6 cycles", "shard 2/3")),
+        ({"first_cycle": 3}, ("cut in another way",)),
+        ({"shards": "three"}, ("cut in another way",)),
+        ({"shards": 4}, ("cut in another way",)),
+        ({"format": "wlplan.dataset/9"}, ("wlplan.dataset/9",)),
+    ],
+)
+def test_shards_that_do_not_belong_together_are_refused(parts, tmp_path, changes, words):
+    stored.update_attributes(parts[1], changes)
+    refused(lambda: merge(parts, tmp_path / "out.zarr"), parts[1].name, *words)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["parts"]
+
+
+def test_all_shards_are_needed_and_each_once(parts, shards, store, tmp_path):
+    out = tmp_path / "out.zarr"
+    refused(lambda: merge([], out), "no shards")
+    refused(lambda: merge(parts[1:2], out), "shard 1/3, 3/3")
+    refused(lambda: merge([*parts, parts[2]], out), "both are shard 3/3")
+    refused(lambda: merge([*parts, shards[3][0]], out), "both are shard 1/3")
+    refused(lambda: merge([*parts, shards[2][0]], out), "shards 2", "has 3")
+    refused(lambda: merge([*parts, store], out), "is no shard")
+    refused(lambda: merge([*parts, tmp_path / "nothing"], out), "no such data set")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["parts"]
+
+
+@pytest.mark.parametrize("damage", ["missing", "truncated", "no array", "other chunks"])
+def test_a_damaged_shard_is_refused(parts, tmp_path, damage):
+    chunk = parts[2] / "h52" / "c" / "0" / "0" / "0"
+    metadata = parts[2] / "h52" / "zarr.json"
+    if damage == "missing":
+        chunk.unlink()
+    elif damage == "truncated":
+        chunk.write_bytes(chunk.read_bytes()[:50])
+    elif damage == "no array":
+        shutil.rmtree(parts[2] / "h52")
+    else:
+        metadata.write_text(metadata.read_text().replace('"clevel": 5', '"clevel": 4'))
+    refused(lambda: merge(parts, tmp_path / "out.zarr"), parts[2].name, "damaged", "collect")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["parts"]
+
+
+def test_a_merge_that_is_done_is_left_alone(parts, tmp_path):
+    out = tmp_path / "out.zarr"
+    merge(parts, out)
+    before = contents(out)
+    merge(parts[::-1], out, progress=lambda *_: pytest.fail("begun anew"))
+    assert contents(out) == before
+    (out / "mass" / "c" / "1").unlink()
+    refused(lambda: merge(parts, out), "out.zarr", "damaged")
+
+
+def test_other_things_are_not_merged_over(parts, copy, tmp_path):
+    (tmp_path / "note.txt").write_text("keep me")
+    before = contents(tmp_path)
+    refused(lambda: merge(parts, copy), "not the data set of these shards")
+    refused(lambda: merge(parts, tmp_path), "not the data set of these shards")
+    refused(lambda: merge(parts, tmp_path / "note.txt"), "not the data set of these shards")
+    refused(lambda: merge(parts, tmp_path / "note.txt" / "x"), "cannot be written")
+    refused(lambda: merge(parts, "/"), "name a folder")
+    refused(lambda: merge(parts, parts[0]), "is a shard")
+    refused(lambda: merge(parts, parts[0] / "x.zarr"), "inside of one")
+    assert contents(tmp_path) == before
+
+
+def test_a_collection_that_was_only_begun_is_not_merged_over(parts, tmp_path):
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collect(tmp_path / "x.zarr", cycles=LONGER, seed=SEED, progress=stop)
+    refused(lambda: merge(parts, tmp_path / "x.zarr"), "not the data set of these shards")
+
+
+def test_two_processes_do_not_merge_to_the_same_place(parts, tmp_path):
+    lock = tmp_path / "out.zarr.lock"
+    lock.write_text(f"{os.getpid()} {stored._start_of(os.getpid())} {socket.gethostname()}")
+    refused(lambda: merge(parts, tmp_path / "out.zarr"), str(os.getpid()), lock.name)
+    assert not (tmp_path / "out.zarr").exists()
+
+
+def test_a_merge_that_does_not_end_leaves_nothing(longer, parts, tmp_path, monkeypatch):
+    out = tmp_path / "out.zarr"
+    before = [contents(path) for path in parts]
+    write, written = merging._write, []
+
+    def full(path, content):
+        written.append(path)
+        if len(written) > 20:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(merging, "_write", full)
+        refused(lambda: merge(parts, out), "No space", "free some space")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["parts"]
+
+    def stop(done, total):
+        if done:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        merge(parts, out, progress=stop)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["parts"]
+    # What a killed process leaves: its hidden folder, and its lock.
+    (tmp_path / ".out.zarr.new" / "mass").mkdir(parents=True)
+    (tmp_path / "out.zarr.lock").write_text(f"99999999 1 {socket.gethostname()}")
+    merge(parts, out)
+    assert contents(out) == contents(longer)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["out.zarr", "parts"]
+    assert [contents(path) for path in parts] == before
+
+
+def test_the_command_line_collects_shards_and_merges_them(shards, longer, tmp_path, capsys):
+    names = [str(tmp_path / f"{i}.zarr") for i in (1, 2)]
+    for i, name in enumerate(names, 1):
+        words = ["collect", "--cycles", LONGER, "--seed", SEED, "--shard", f"{i}/2", "--json"]
+        assert cli.main([*map(str, words), "--out", name]) == 0
+        document = json.loads(capsys.readouterr().out)
+        assert document == {
+            "out": name,
+            "cycles": LONGER,
+            "seed": SEED,
+            "shard": i,
+            "shards": 2,
+        }
+        assert contents(tmp_path / f"{i}.zarr") == contents(shards[2][i - 1])
+    out = str(tmp_path / "data.zarr")
+    assert cli.main(["collect", "--merge", *names, "--out", out, "--json"]) == 0
+    told, progress = capsys.readouterr()
+    assert json.loads(told) == {"out": out, "cycles": LONGER, "seed": SEED, "merged": names}
+    assert f"cycles {LONGER}/{LONGER}" in progress
+    assert contents_but_command(tmp_path / "data.zarr") == contents_but_command(longer)
+    assert cli.main(["collect", "--merge", names[0], "--out", str(tmp_path / "x")]) == 2
+    told, complaint = capsys.readouterr()
+    assert told == ""
+    assert complaint.startswith("error: ")
+    assert complaint.count("\n") == 1
+
+
+# --- processes
+
+# `wlplan collect` with the short rollouts of these tests.
+CHILD = """
+import sys
+from wlplan import cli
+from wlplan.dataset import protocol, store, workbench
+for part in (protocol, workbench, store):
+    part.LOADS = 3
+protocol._BATCH = 2
+sys.exit(cli.main(["collect", *sys.argv[1:]]))
+"""
+
+
+def start(*words):
+    """A process that collects."""
+    return subprocess.Popen(
+        [sys.executable, "-c", CHILD, *map(str, words)], stderr=subprocess.PIPE, text=True
+    )
+
+
+def wait_until(condition, process):
+    """Waits for what a process that runs on is to bring about."""
+    until = time.monotonic() + 300.0
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < until
+        time.sleep(0.005)
+
+
+def cycles_done(path):
+    """Number of cycles in a store so far; -1 without a store."""
+    try:
+        return json.loads((path / "zarr.json").read_text())["attributes"]["cycles_done"]
+    except FileNotFoundError:
+        return -1
+
+
+@pytest.mark.slow
+def test_a_killed_shard_goes_on_and_ends_with_the_same_bytes(tmp_path):
+    cycles = 480
+    collect(tmp_path / "want.zarr", cycles=cycles, seed=SEED, shard=(2, 2))
+    path = tmp_path / "got.zarr"
+    command = ("--cycles", cycles, "--seed", SEED, "--shard", "2/2", "--out", path)
+    for least in (0, 6, 120):
+        process = start(*command)
+        wait_until(lambda least=least: cycles_done(path) >= least, process)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+        assert least <= cycles_done(path) < 240
+        assert path.with_name("got.zarr.lock").exists()
+    process = start(*command)
+    process.communicate()
+    assert process.returncode == 0
+    assert contents_but_command(path) == contents_but_command(tmp_path / "want.zarr")
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["got.zarr", "want.zarr"]
+
+
+@pytest.mark.slow
+def test_of_two_collectors_at_once_one_is_refused(store, tmp_path):
+    path = tmp_path / "data.zarr"
+    command = ("--cycles", CYCLES, "--seed", SEED, "--out", path)
+    first = start(*command)
+    wait_until(path.exists, first)
+    second = start(*command)
+    _, told = second.communicate()
+    assert first.poll() is None
+    assert second.returncode == 2
+    assert told.startswith(f"error: {path}: is being written by process {first.pid}")
+    assert told.count("\n") == 1
+    first.communicate()
+    assert first.returncode == 0
+    assert contents_but_command(path) == contents_but_command(store)
 
 
 # --- reading

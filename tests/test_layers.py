@@ -20,7 +20,7 @@ LAYERS = [
     *("simulator.controller", "simulator.soil", "simulator.loader", "simulator.terrain"),
     *("simulator.cycle", "simulator.world", "simulator"),
     *("sampling", "dataset.variables", "dataset.protocol", "dataset.workbench", "dataset.store"),
-    *("dataset.collecting", "dataset"),
+    *("dataset.collecting", "dataset.merging", "dataset"),
     *("models", "models.normaliser", "models.performance", "training"),
     *("worlds", "horizon"),
     *("transport", "objective"),

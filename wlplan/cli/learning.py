@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from wlplan.cli.inputs import check_is_folder, check_model
-from wlplan.cli.options import with_options
+from wlplan.cli.options import ShardNumber, with_options
 from wlplan.cli.outputs import QUANTITIES, checked_folder, json_text, print_table, titled_table
 from wlplan.cli.progress import Progress, Stopwatch
+from wlplan.errors import InputError
 
 # A data set of so many takes 27 GB.
 _MOST_CYCLES = 1_000_000
@@ -24,15 +26,41 @@ _MOST_CYCLES = 1_000_000
         type=click.IntRange(1, _MOST_CYCLES),
         default=10_800,
         show_default=True,
-        help="Number of loading cycles.",
+        help="Number of loading cycles, of all shards together.",
     ),
-    click.option("--out", metavar="DATA.zarr", required=True, help="Data set to write."),
+    click.option("--out", metavar="DATA.zarr", required=True, help="Data set or shard to write."),
+    click.option(
+        "--shard",
+        type=ShardNumber(),
+        default=None,
+        help="Play only the I-th of N parts, 1/N to N/N, of whole batches of cycles.",
+    ),
+    click.option(
+        "--merge", "merging", is_flag=True, help="Join all shards PART.zarr instead of playing."
+    ),
+    click.argument("parts", metavar="[--merge PART.zarr...]", nargs=-1),
 )
-def collect(cycles: int, out: str, seed: int, as_json: bool) -> None:
+def collect(
+    cycles: int,
+    out: str,
+    shard: tuple[int, int] | None,
+    merging: bool,
+    parts: tuple[str, ...],
+    seed: int,
+    as_json: bool,
+) -> None:
     """Play random loading cycles in the simulator and store them as training data.
 
     Interrupted, the same command goes on where it stopped.
+
+    Several machines share the work with --shard: each plays a part, with the same --cycles and
+    --seed. --merge then joins the parts to the data set that one machine would have written.
     """
+    if merging:
+        _merge(parts, out, as_json)
+        return
+    if parts:
+        raise InputError(f"{parts[0]}: shards are only named with --merge: add it or leave it out.")
     checked_folder(out)
 
     from wlplan.dataset import collect as collect_cycles
@@ -42,12 +70,40 @@ def collect(cycles: int, out: str, seed: int, as_json: bool) -> None:
             out,
             cycles=cycles,
             seed=seed,
+            shard=shard,
             progress=lambda done, total: progress("cycles", done, total, None),
         )
     if as_json:
-        click.echo(json_text({"out": out, "cycles": cycles, "seed": seed}))
+        part = {} if shard is None else {"shard": shard[0], "shards": shard[1]}
+        click.echo(json_text({"out": out, "cycles": cycles, "seed": seed, **part}))
         return
-    print(f"{cycles} cycles in {out}; {playing.text()}")
+    which = "" if shard is None else f"shard {shard[0]}/{shard[1]} of "
+    print(f"{which}{cycles} cycles in {out}; {playing.text()}")
+
+
+def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
+    """`collect --merge`: the shards say which cycles and seed they are of."""
+    context = click.get_current_context()
+    for name in ("shard", "cycles", "seed"):
+        if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
+            raise InputError(f"--{name} does not go with --merge: leave one of them out.")
+    if not parts:
+        raise InputError("--merge needs the shards to join: name all of them.")
+    for part in parts:
+        check_is_folder(part, "shard", "wlplan collect --shard")
+    checked_folder(out)
+
+    from wlplan.dataset import merge
+
+    with Progress() as progress:
+        attributes = merge(
+            parts, out, progress=lambda done, total: progress("cycles", done, total, None)
+        )
+    cycles, seed = attributes["cycles"], attributes["seed"]
+    if as_json:
+        click.echo(json_text({"out": out, "cycles": cycles, "seed": seed, "merged": list(parts)}))
+        return
+    print(f"{cycles} cycles of {len(parts)} {'shard' if len(parts) == 1 else 'shards'} in {out}")
 
 
 @click.command()

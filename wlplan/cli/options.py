@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -71,6 +72,28 @@ class ActionNumbers(Numbers):
                     f"{name} is {number:g}, outside its range {low:g} to {high:g}", param, ctx
                 )
         return numbers
+
+
+class ShardNumber(click.ParamType):
+    """Which part of a whole, counted from 1, and how many parts there are."""
+
+    name = "I/N"
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """What stands for the value in the help."""
+        return self.name
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        """Both numbers of a text; numbers themselves are let pass, as click asks for."""
+        if isinstance(value, tuple):
+            return value
+        found = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", str(value))
+        number, count = map(int, found.groups()) if found else (0, 0)
+        if not 1 <= number <= count:
+            self.fail(f"{value!r} is not of the form I/N with 1 <= I <= N", param, ctx)
+        return number, count
 
 
 def with_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:

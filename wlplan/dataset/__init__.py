@@ -6,10 +6,12 @@ of the pile as it then is, heads into it to within 10 degrees of the normal, and
 from a Latin hypercube. A set is one rollout of each seed pile; its 180 actions are one hypercube.
 
 Everything random about a rollout follows from the seed and the number of the rollout alone, so a
-collection that was cut short goes on where it stopped and ends with the same bytes.
+collection that was cut short goes on where it stopped and ends with the same bytes. For the same
+reason shards, collected apart and joined, are the data set of a single collector.
 """
 
 from wlplan.dataset.collecting import collect
+from wlplan.dataset.merging import merge
 from wlplan.dataset.store import DATASET_FORMAT, open_dataset, versions
 from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, fingerprint, reflect, split
 
@@ -20,6 +22,7 @@ __all__ = [
     "Dataset",
     "collect",
     "fingerprint",
+    "merge",
     "open_dataset",
     "reflect",
     "split",

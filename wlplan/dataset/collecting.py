@@ -22,6 +22,7 @@ def collect(
     *,
     cycles: int,
     seed: int = 0,
+    shard: tuple[int, int] | None = None,
     simulator: Simulator = _SIMULATOR,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
@@ -30,35 +31,43 @@ def collect(
     A data set of more cycles is a longer series of the same rollouts. Cycles are written batch by
     batch; what was written stays intact whatever happens to the process.
 
+    A shard is a part of a data set that is collected on its own, with the same cycles as in the
+    whole; `merge` joins shards.
+
     Args:
         path: Directory of the data set, a zarr (version 3) group; by custom it ends in `.zarr`.
             Missing directories above it are made.
-        cycles: Number of loading cycles; the last rollout is cut short to meet it.
+        cycles: Number of loading cycles, of all shards together; the last rollout is cut short to
+            meet it.
         seed: Seed of piles, poses and actions.
+        shard: Which part to collect, counted from 1, and how many there are; None: everything.
         simulator: The simulator with its machine and soil.
-        progress: Called with the number of cycles played so far and in all.
+        progress: Called with the number of cycles played so far and in all, of the shard if it is
+            one.
 
     Raises:
-        InputError: If the path holds something else or a data set of another seed, number of
-            cycles or simulator; if another process writes it; or if it cannot be written.
+        InputError: If there is no such shard, or it would be empty; if the path holds something
+            else or a data set of another seed, number of cycles, shard or simulator; if another
+            process writes it; or if it cannot be written.
     """
     path = Path(path)
-    if cycles < 1:
-        raise InputError(f"{cycles} cycles asked for: it has to be at least 1.")
+    layout = Layout(cycles, shard)
     if seed < 0:
         raise InputError(f"The seed is {seed}: it has to be 0 or more.")
-    layout = Layout(cycles)
     done = 0
     try:
         path.parent.mkdir(parents=True, exist_ok=True)  # the lock goes there
         with store.lock(path):
-            wanted = store.identity(cycles, seed, simulator)
+            wanted = store.identity(layout, seed, simulator)
             if store.is_new(path):
                 store.create(path, layout, wanted)
             done = store.resume(path, wanted)
             if progress is not None:
-                progress(done, cycles)
-            with contextlib.closing(batches_of(layout, done, seed, simulator, progress)) as batches:
+                progress(done, layout.size)
+            start = layout.first + done
+            with contextlib.closing(
+                batches_of(layout, start, seed, simulator, progress)
+            ) as batches:
                 for batch in batches:
                     store.write(path, batch, done)
                     done += len(batch["mass"])
@@ -67,5 +76,7 @@ def collect(
         reason = error.strerror or str(error) or type(error).__name__
         advice = "free some space" if error.errno == errno.ENOSPC else "choose another place"
         if done:
-            advice += f"; {done} of {cycles} cycles are safe, the same command goes on from there"
+            advice += (
+                f"; {done} of {layout.size} cycles are safe, the same command goes on from there"
+            )
         raise InputError(f"{path}: cannot be written ({reason}): {advice}.") from error

@@ -32,13 +32,36 @@ _ROLLOUT_STREAM, _ACTION_STREAM = 0, 1
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """How many cycles are rolled out in which portions."""
+    """How many cycles are rolled out in which portions, and which part of them is meant.
+
+    Attributes:
+        cycles: Number of cycles of the whole collection.
+        shard: Which part is meant, counted from 1, and how many there are; None: the whole.
+
+    Raises:
+        InputError: If there are no cycles, there is no such part, or parts would be empty.
+    """
 
     cycles: int
+    shard: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.cycles < 1:
+            raise InputError(f"{self.cycles} cycles asked for: it has to be at least 1.")
+        number, count = self.shard or (1, 1)
+        if not 1 <= number <= count:
+            raise InputError(
+                f"There is no shard {number}/{count}: give 1/{count} to {count}/{count}."
+            )
+        if count > self.batches:
+            raise InputError(
+                f"{self.cycles} cycles cannot be cut into {count} shards: a shard holds whole "
+                f"batches of {self.batch_cycles} cycles, so at most {self.batches} make sense."
+            )
 
     @property
     def rollouts(self) -> int:
-        """Rollouts to play, the last perhaps in part."""
+        """Rollouts of the whole, the last perhaps in part."""
         return math.ceil(self.cycles / LOADS)
 
     @property
@@ -50,6 +73,28 @@ class Layout:
     def batch_cycles(self) -> int:
         """Cycles that are written at once."""
         return min(_BATCH * LOADS, self.cycles)
+
+    @property
+    def batches(self) -> int:
+        """Batches of the whole, the last perhaps in part."""
+        return math.ceil(self.cycles / self.batch_cycles)
+
+    @property
+    def first(self) -> int:
+        """First cycle of the part, counted from 0 in the whole."""
+        number, count = self.shard or (1, 1)
+        return (number - 1) * self.batches // count * self.batch_cycles
+
+    @property
+    def stop(self) -> int:
+        """The cycle after the last of the part."""
+        number, count = self.shard or (1, 1)
+        return min(number * self.batches // count * self.batch_cycles, self.cycles)
+
+    @property
+    def size(self) -> int:
+        """Number of cycles in the part."""
+        return self.stop - self.first
 
 
 class Rollout:

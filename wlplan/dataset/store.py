@@ -26,12 +26,20 @@ from wlplan.simulator import Simulator
 
 DATASET_FORMAT = "wlplan.dataset/1"
 
+SHARD_ATTRIBUTES = ("shard", "shards", "first_cycle", "whole_cycles")
+"""Attributes that a shard has and a whole data set has not."""
 
-def identity(cycles: int, seed: int, simulator: Simulator) -> dict[str, Any]:
+
+def identity(layout: Layout, seed: int, simulator: Simulator) -> dict[str, Any]:
     """What must agree for two collections to end with the same cycles, as JSON holds it."""
+    shard: dict[str, int] = {}
+    if layout.shard is not None:
+        values = (*layout.shard, layout.first, layout.cycles)
+        shard = dict(zip(SHARD_ATTRIBUTES, values, strict=True))
     identity = {
         "format": DATASET_FORMAT,
-        "cycles": cycles,
+        **shard,
+        "cycles": layout.size,
         "seed": seed,
         "soil": dataclasses.asdict(simulator.soil),
         "machine": dataclasses.asdict(simulator.machine),
@@ -47,49 +55,61 @@ def is_new(path: Path) -> bool:
     return not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir()))
 
 
-def create(path: Path, layout: Layout, identity: Mapping[str, Any]) -> None:
-    """Makes the empty arrays beside their place and moves them there in one step."""
-    import zarr
-    from zarr.codecs import BloscCodec
+@contextlib.contextmanager
+def beside(path: Path) -> Iterator[Path]:
+    """A hidden place beside a path to write to; what is there moves to the path in one step.
 
+    Nothing is left of it if the block fails. What a killed process left there is removed first.
+    """
     beside = path.with_name(f".{path.name}.new")
     shutil.rmtree(beside, ignore_errors=True)
     try:
-        group = zarr.create_group(
-            store=str(beside),
-            zarr_format=3,
-            attributes={
-                **identity,
-                "title": "Loading cycles of a simulated wheel loader",
-                "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-                "versions": versions(),
-                "cycles_done": 0,
-            },
-        )
-        for name, variable in VARIABLES.items():
-            group.create_array(
-                name,
-                shape=(layout.cycles, *variable.shape),
-                chunks=(layout.batch_cycles, *variable.shape),
-                dtype=variable.dtype,
-                # Bytes of equal weight side by side compress to two thirds.
-                compressors=BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"),
-                dimension_names=("cycle", *variable.dims),
-                attributes={
-                    "long_name": variable.long_name,
-                    "units": variable.units,
-                    **variable.attributes,
-                },
-            )
-        # A copy of all metadata in the group's own: xarray looks for it and complains without. That
-        # is a convention, not yet part of the format, says the warning.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            zarr.consolidate_metadata(str(beside), zarr_format=3)
+        yield beside
         os.replace(beside, path)
     except BaseException:
         shutil.rmtree(beside, ignore_errors=True)
         raise
+
+
+def create(path: Path, layout: Layout, identity: Mapping[str, Any]) -> None:
+    """Makes a data set without cycles, all of it or nothing."""
+    attributes = {
+        **identity,
+        "title": "Loading cycles of a simulated wheel loader",
+        "command": command(),
+        "versions": versions(),
+        "cycles_done": 0,
+    }
+    with beside(path) as new:
+        make_arrays(new, layout, attributes)
+
+
+def make_arrays(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> None:
+    """Makes a group with these attributes and the empty arrays of a part."""
+    import zarr
+    from zarr.codecs import BloscCodec
+
+    group = zarr.create_group(store=str(path), zarr_format=3, attributes=dict(attributes))
+    for name, variable in VARIABLES.items():
+        group.create_array(
+            name,
+            shape=(layout.size, *variable.shape),
+            chunks=(layout.batch_cycles, *variable.shape),
+            dtype=variable.dtype,
+            # Bytes of equal weight side by side compress to two thirds.
+            compressors=BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"),
+            dimension_names=("cycle", *variable.dims),
+            attributes={
+                "long_name": variable.long_name,
+                "units": variable.units,
+                **variable.attributes,
+            },
+        )
+    # A copy of all metadata in the group's own: xarray looks for it and complains without. That is
+    # a convention, not yet part of the format, says the warning.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(str(path), zarr_format=3)
 
 
 def resume(path: Path, wanted: Mapping[str, Any]) -> int:
@@ -98,21 +118,46 @@ def resume(path: Path, wanted: Mapping[str, Any]) -> int:
     Raises:
         InputError: If it is not the data set that is wanted.
     """
-    attributes = _read_attributes(path)
-    for name, value in wanted.items():
-        found = attributes.get(name)
-        if found != value:
-            if isinstance(value, dict) and isinstance(found, dict):
-                field = next(k for k in value if found.get(k) != value[k])
-                name, found, value = f"{name} ({field})", found.get(field), value[field]
-            raise InputError(
-                f"{path}: was begun with {name} {found!r}, not {value!r}: use the same settings to "
-                f"go on with it, or choose another place."
-            )
+    attributes = read_attributes(path)
+    if part_of(attributes) != part_of(wanted):
+        raise InputError(
+            f"{path}: was begun as {part_of(attributes)}, not as {part_of(wanted)}: choose another "
+            f"place."
+        )
+    differs = difference({name: attributes.get(name) for name in wanted}, wanted)
+    if differs is not None:
+        name, found, value = differs
+        raise InputError(
+            f"{path}: was begun with {name} {found!r}, not {value!r}: use the same settings to go "
+            f"on with it, or choose another place."
+        )
     # A process that was killed while it wrote leaves files that were never finished.
     for partial_file in path.glob("**/*.partial"):
         partial_file.unlink(missing_ok=True)
     return int(attributes["cycles_done"])
+
+
+def part_of(attributes: Mapping[str, Any]) -> str:
+    """Which part of a data set attributes belong to, in words."""
+    if "shard" not in attributes:
+        return "a whole data set"
+    return f"shard {attributes['shard']}/{attributes.get('shards')}"
+
+
+def difference(
+    found: Mapping[str, Any], wanted: Mapping[str, Any]
+) -> tuple[str, object, object] | None:
+    """The first attribute, or field of one, that differs: its name and both values."""
+    for name in {**wanted, **found}:
+        one, other = found.get(name), wanted.get(name)
+        if one == other:
+            continue
+        if isinstance(one, dict) and isinstance(other, dict):
+            inner = difference(one, other)
+            if inner is not None:
+                return f"{name} ({inner[0]})", *inner[1:]
+        return name, one, other
+    return None
 
 
 def write(path: Path, batch: Mapping[str, np.ndarray], start: int) -> None:
@@ -128,7 +173,7 @@ def write(path: Path, batch: Mapping[str, np.ndarray], start: int) -> None:
             array[start : start + len(values)] = values
 
 
-def _read_attributes(path: Path) -> dict[str, Any]:
+def read_attributes(path: Path) -> dict[str, Any]:
     """The attributes of the group of a data set.
 
     Raises:
@@ -166,6 +211,11 @@ def update_attributes(path: Path, changes: Mapping[str, Any]) -> None:
     os.replace(beside, target)
 
 
+def command() -> str:
+    """The words that this process was started with."""
+    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+
+
 def versions() -> dict[str, str]:
     """Versions of the packages that decide the numbers."""
     return {name: importlib.metadata.version(name) for name in ("wlplan", "jax", "numpy")}
@@ -176,8 +226,10 @@ def lock(path: Path) -> Iterator[None]:
     """Keeps two processes from writing the same data set; a lock of a dead process is taken over.
 
     Raises:
-        InputError: If a running process holds it.
+        InputError: If a running process holds it, or the path ends without a name to put beside.
     """
+    if not path.name:
+        raise InputError(f"{path}: is no place of its own: name a folder for the data set.")
     lock = path.with_name(f"{path.name}.lock")
     mine = f"{os.getpid()} {_start_of(os.getpid())} {socket.gethostname()}"
     for attempt in itertools.count():
@@ -236,12 +288,18 @@ def open_dataset(path: str | os.PathLike[str]) -> Dataset:
     """Reads a complete data set into memory, 27 kB a cycle.
 
     Raises:
-        InputError: If it is missing, not complete, damaged, or of another format.
+        InputError: If it is missing, not complete, damaged, of another format, or a shard: who
+            trains on a part should not do so unawares.
     """
     import zarr
 
     path = Path(path)
-    attributes = _read_attributes(path)
+    attributes = read_attributes(path)
+    if "shard" in attributes:
+        raise InputError(
+            f"{path}: is {part_of(attributes)} of a data set: join all of its shards with "
+            f"`wlplan collect --merge` first."
+        )
     cycles, done = int(attributes["cycles"]), int(attributes["cycles_done"])
     if done < cycles:
         raise InputError(

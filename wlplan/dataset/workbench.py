@@ -46,8 +46,8 @@ def batches_of(
     simulator: Simulator,
     progress: Callable[[int, int], None] | None,
 ) -> Generator[dict[str, np.ndarray]]:
-    """The variables of one batch of cycles after the other, from cycle `start` on."""
-    numbers = range(start // LOADS, layout.rollouts)
+    """The variables of one batch of cycles after the other, from cycle `start` of the whole on."""
+    numbers = range(start // LOADS, math.ceil(layout.stop / LOADS))
     waiting, finished = iter(numbers), queue.SimpleQueue[Any]()
     lock, stopped = threading.Lock(), threading.Event()
 
@@ -89,14 +89,14 @@ def _in_order(
 
     Args:
         layout: Portions of the collection.
-        start: First cycle.
+        start: First cycle, counted in the whole.
         finished: Loadings that are played as None, rollouts that are finished, and errors.
         progress: As for `collect`.
     """
     rollouts: dict[int, Rollout] = {}
     played = start
-    while start < layout.cycles:
-        stop = min(start + layout.batch_cycles, layout.cycles)
+    while start < layout.stop:
+        stop = min(start + layout.batch_cycles, layout.stop)
         numbers = range(start // LOADS, math.ceil(stop / LOADS))
         while not all(number in rollouts for number in numbers):
             news = finished.get()
@@ -106,7 +106,7 @@ def _in_order(
                 played += 1
                 if progress is not None:
                     # Those of the last rollout that are cut off do not count.
-                    progress(min(played, layout.cycles), layout.cycles)
+                    progress(min(played, layout.stop) - layout.first, layout.size)
             else:
                 rollouts[news.number] = news
         parts = [rollouts.pop(number).records() for number in numbers]
