@@ -501,6 +501,8 @@ def test_a_soil_or_machine_that_cannot_be_is_one_line(
         (["collect", "--out", "x.zarr", "--merge", "a.zarr", "--seed", "0"], "--seed"),
         (["train"], "MODEL"),
         (["train", "psi-nothing", "--data", "a", "--out", "b"], "psi-low"),
+        (["collect", "--out", "x.zarr", "--merge", "a.zarr", "--soil", "sand"], "--soil"),
+        (["collect", "--out", "x.zarr", "--soil", "snad"], "sand"),
         (["train", "psi-low", "--data", "missing", "--out", "b"], "wlplan collect"),
         (["evaluate"], "--data"),
         (["evaluate", "--data", "missing"], "no such data set"),
@@ -556,6 +558,20 @@ def test_a_place_for_data_that_cannot_be_written_is_refused_and_nothing_left(
 
 
 @pytest.mark.parametrize("command", sorted(cli.wlplan.commands))
+def test_collect_takes_soil_and_machine(run, monkeypatch, tmp_path):
+    (tmp_path / "narrow.toml").write_text("bucket_width = 2.0\n")
+    simulators = []
+    monkeypatch.setattr(
+        dataset, "collect", lambda *_, simulator, **__: simulators.append(simulator)
+    )
+    words = ("collect", "--out", tmp_path / "x.zarr", "--soil", "sand")
+    code, out, _ = run(*words, "--machine", tmp_path / "narrow.toml")
+    assert code == 0
+    assert "cycles in" in out
+    assert simulators[0].soil == SAND
+    assert simulators[0].machine == dataclasses.replace(WA320, bucket_width=2.0)
+
+
 def test_every_command_explains_itself_and_has_the_common_options(run, command):
     code, out, err = run(command, "--help")
     assert (code, err) == (0, "")

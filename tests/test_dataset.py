@@ -364,10 +364,18 @@ def test_two_processes_do_not_write_the_same_store(copy):
     assert lock.exists()
 
 
+def test_a_lock_that_is_not_signed_yet_is_left_alone(copy):
+    lock = copy.with_name("copy.zarr.lock")
+    lock.write_text("")
+    refused(lambda: collect(copy, cycles=CYCLES, seed=SEED), "is being written", lock.name)
+    assert lock.exists()
+
+
 @pytest.mark.parametrize("holder", ["", "99999999 1 {host}", "{pid} 1 {host}", "nonsense"])
 def test_the_lock_of_a_dead_process_is_taken_over(copy, holder):
     lock = copy.with_name("copy.zarr.lock")
     lock.write_text(holder.format(pid=os.getpid(), host=socket.gethostname()))
+    os.utime(lock, (0.0, 0.0))
     collect(copy, cycles=CYCLES, seed=SEED)
     assert not lock.exists()
 

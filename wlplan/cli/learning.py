@@ -9,8 +9,8 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from wlplan.cli.inputs import check_is_folder, check_model
-from wlplan.cli.options import ShardNumber, with_options
+from wlplan.cli.inputs import check_is_folder, check_model, site_named
+from wlplan.cli.options import ShardNumber, site_options, with_options
 from wlplan.cli.outputs import QUANTITIES, checked_folder, json_text, print_table, titled_table
 from wlplan.cli.progress import Progress, Stopwatch
 from wlplan.errors import InputError
@@ -38,6 +38,7 @@ _MOST_CYCLES = 1_000_000
     click.option(
         "--merge", "merging", is_flag=True, help="Join all shards PART.zarr instead of playing."
     ),
+    *site_options(),
     click.argument("parts", metavar="[--merge PART.zarr...]", nargs=-1),
 )
 def collect(
@@ -45,6 +46,8 @@ def collect(
     out: str,
     shard: tuple[int, int] | None,
     merging: bool,
+    soil: str | None,
+    machine: str | None,
     parts: tuple[str, ...],
     seed: int,
     as_json: bool,
@@ -53,8 +56,8 @@ def collect(
 
     Interrupted, the same command goes on where it stopped.
 
-    Several machines share the work with --shard: each plays a part, with the same --cycles and
-    --seed. --merge then joins the parts to the data set that one machine would have written.
+    Several machines share the work with --shard: each plays a part, with the same settings.
+    --merge then joins the parts to the data set that one machine would have written.
     """
     if merging:
         _merge(parts, out, as_json)
@@ -62,14 +65,17 @@ def collect(
     if parts:
         raise InputError(f"{parts[0]}: shards are only named with --merge: add it or leave it out.")
     checked_folder(out)
+    site = site_named(soil, machine)
 
     from wlplan.dataset import collect as collect_cycles
+    from wlplan.simulator import Simulator
 
     with Progress() as progress, Stopwatch() as playing:
         collect_cycles(
             out,
             cycles=cycles,
             seed=seed,
+            simulator=Simulator(machine=site.machine, soil=site.soil),
             shard=shard,
             progress=lambda done, total: progress("cycles", done, total, None),
         )
@@ -84,7 +90,7 @@ def collect(
 def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
     """`collect --merge`: the shards say which cycles and seed they are of."""
     context = click.get_current_context()
-    for name in ("shard", "cycles", "seed"):
+    for name in ("shard", "cycles", "seed", "soil", "machine"):
         if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
             raise InputError(f"--{name} does not go with --merge: leave one of them out.")
     if not parts:

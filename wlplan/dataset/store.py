@@ -12,6 +12,7 @@ import shlex
 import shutil
 import socket
 import sys
+import time
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -28,6 +29,9 @@ DATASET_FORMAT = "wlplan.dataset/1"
 
 SHARD_ATTRIBUTES = ("shard", "shards", "first_cycle", "whole_cycles")
 """Attributes that a shard has and a whole data set has not."""
+
+# A lock that is empty for longer was left by a process that died before it signed it [s].
+_SIGNING_TIME = 10.0
 
 
 def identity(layout: Layout, seed: int, simulator: Simulator) -> dict[str, Any]:
@@ -239,7 +243,7 @@ def lock(path: Path) -> Iterator[None]:
             holder = ""
             with contextlib.suppress(OSError):
                 holder = lock.read_text("utf-8")
-            if _is_alive(holder) or attempt > 2:
+            if _is_alive(holder) or (not holder and _is_young(lock)) or attempt > 2:
                 raise InputError(
                     f"{path}: is being written by process {holder.split(' ')[0] or '?'}: wait for "
                     f"it, or delete {lock.name} if it is gone."
@@ -253,6 +257,13 @@ def lock(path: Path) -> Iterator[None]:
         yield
     finally:
         lock.unlink(missing_ok=True)
+
+
+def _is_young(lock: Path) -> bool:
+    """Whether a lock was made just now, so that its holder may not have signed it yet."""
+    with contextlib.suppress(OSError):
+        return time.time() - lock.stat().st_mtime < _SIGNING_TIME
+    return False
 
 
 def _is_alive(holder: str) -> bool:
