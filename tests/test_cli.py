@@ -554,10 +554,6 @@ def test_a_place_for_data_that_cannot_be_written_is_refused_and_nothing_left(
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-# --- help, names, report
-
-
-@pytest.mark.parametrize("command", sorted(cli.wlplan.commands))
 def test_collect_takes_soil_and_machine(run, monkeypatch, tmp_path):
     (tmp_path / "narrow.toml").write_text("bucket_width = 2.0\n")
     simulators = []
@@ -572,6 +568,10 @@ def test_collect_takes_soil_and_machine(run, monkeypatch, tmp_path):
     assert simulators[0].machine == dataclasses.replace(WA320, bucket_width=2.0)
 
 
+# --- help, names, report
+
+
+@pytest.mark.parametrize("command", sorted(cli.wlplan.commands))
 def test_every_command_explains_itself_and_has_the_common_options(run, command):
     code, out, err = run(command, "--help")
     assert (code, err) == (0, "")
