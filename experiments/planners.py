@@ -95,7 +95,8 @@ def draw(folder: Path) -> None:
             axis.bar([k + offset for k in range(len(rows))], costs, 0.38, label=where, color=colour)
             for k, cost in enumerate(costs):
                 axis.text(k + offset, cost, f"{cost:.1f}", ha="center", va="bottom", fontsize=7)
-        axis.set_xticks(range(len(rows)), [row["planner"].replace(" + ", "\n+ ") for row in rows])
+        names = [row["planner"] for row in rows]
+        axis.set_xticks(range(len(rows)), names, rotation=35, ha="right", rotation_mode="anchor")
         axis.set_title(f"{kind}, {result['slope_degrees']:g}°")
         lowest = min(row[where]["cost"] for row in rows for where in ("model", "simulator"))
         axis.set_ylim(0.9 * lowest)
