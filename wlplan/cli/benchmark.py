@@ -74,10 +74,10 @@ def _print_bench(document: Mapping[str, Any]) -> None:
     table = titled_table(
         f"{device['processor']}, {device['cores']} cores; JAX {versions['jax']} on {device['kind']}"
     )
-    table.add_column("item", width=34)
+    table.add_column("item", width=30)
     for column in ("compile", "run,\nmedian", "10th to 90th\npercentile", "runs"):
         table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("found", width=32)
+    table.add_column("found", width=28)
     table.add_column("to reach", width=20)
     table.add_column("met", width=3)
     records = document["items"]
