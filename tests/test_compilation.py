@@ -1,11 +1,13 @@
 """Several rollouts side by side: the same as one after the other."""
 
+import os
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan.compilation import EachRow
+from wlplan.compilation import EachRow, cores, kept, stored
 
 
 def shifted(shared, row):
@@ -54,3 +56,28 @@ def test_an_error_in_a_row_reaches_the_caller():
 
     with pytest.raises(ValueError, match="no such row"):
         EachRow(refuses)(jnp.zeros(1), jnp.zeros((3, 2)))
+
+
+def test_what_is_kept_is_what_it_was():
+    values = {"a": jnp.arange(3.0), "b": jnp.ones((2, 2))}
+    through = jax.jit(lambda values, source: kept(values, source))
+    jax.tree.map(np.testing.assert_array_equal, through(values, jnp.float32(0.0)), values)
+    gradient = jax.grad(lambda a: (kept(a**2, a[0])).sum())(jnp.arange(3.0))
+    np.testing.assert_array_equal(gradient, 2.0 * np.arange(3.0))
+
+
+def test_what_comes_from_nan_is_nan():
+    """Not zero: that would hide it."""
+    found = jax.jit(lambda x: kept(jnp.ones(3), x))(jnp.float32(np.nan))
+    assert np.isnan(found).all() or jax.default_backend() != "cpu"
+
+
+def test_what_is_not_wanted_is_filled():
+    fill = jax.jit(lambda wanted: stored(jnp.ones(2), wanted, otherwise=5.0))
+    np.testing.assert_array_equal(fill(jnp.array(True)), [1.0, 1.0])
+    if jax.default_backend() == "cpu":
+        np.testing.assert_array_equal(fill(jnp.array(False)), [5.0, 5.0])
+
+
+def test_at_least_one_core_is_there():
+    assert 1 <= cores() <= os.cpu_count()
