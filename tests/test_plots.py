@@ -13,6 +13,8 @@ from wlplan import plots
 from wlplan.diggability import DiggabilityMap, edge_poses
 from wlplan.errors import InputError
 from wlplan.pile import seed_pile, toe_contour
+from wlplan.plots.digs import _first_crossing, _on_pile, label_places
+from wlplan.plots.relief import _relief
 from wlplan.transport import Receiver
 from wlplan.types import Action, LoadingPlan, Performance, Pose
 
@@ -105,22 +107,22 @@ def test_crowded_labels_do_not_overlap_nor_cover_the_pile(pile):
     digs = np.array([3.4, 0.0]) + random.normal(0.0, 0.3, (40, 2))
     heading = math.pi + random.normal(0.0, 0.2, 40)
     radius = 0.4
-    labels = plots._label_places(digs, heading, radius, pile)
+    labels = label_places(digs, heading, radius, pile)
     apart = [np.hypot(*(a - b)) for a, b in itertools.combinations(labels, 2)]
     assert min(apart) > 2.0 * radius
-    assert not plots._on_pile(labels, pile).any()
-    assert plots._first_crossing(digs, labels) is None
+    assert not _on_pile(labels, pile).any()
+    assert _first_crossing(digs, labels) is None
 
 
 def test_crossing_lines_are_found():
     starts, ends = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0, 1.0], [0.0, 1.0]])
-    assert plots._first_crossing(starts, ends) == (0, 1)
-    assert plots._first_crossing(starts, ends[::-1]) is None
+    assert _first_crossing(starts, ends) == (0, 1)
+    assert _first_crossing(starts, ends[::-1]) is None
 
 
 def test_slopes_that_face_the_light_are_brighter():
     x = np.arange(20.0)[:, np.newaxis] * np.ones(20)
-    level, west, east = (plots._relief(slope * x, 1.0) for slope in (0.0, 0.5, -0.5))
+    level, west, east = (_relief(slope * x, 1.0) for slope in (0.0, 0.5, -0.5))
     np.testing.assert_allclose(level, 1.0)
     assert west.min() > 1.0 > east.max()
 

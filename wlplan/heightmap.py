@@ -71,6 +71,14 @@ def cell_centres(pile: Pile) -> tuple[Float[Array, "nx ny"], Float[Array, "nx ny
     return jnp.broadcast_to(x[:, None], (nx, ny)), jnp.broadcast_to(y[None, :], (nx, ny))
 
 
+def local_points(
+    pose: Pose, cells: int, displacement: float, dtype: np.dtype
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """World positions x and y of the cells of a local map [m]; arguments as for `sample_local`."""
+    along, left = (jnp.asarray(a, dtype) for a in local_axes(cells, displacement))
+    return to_world(pose, *jnp.meshgrid(along, left, indexing="ij"))
+
+
 def sample_local(
     pile: Pile,
     pose: Pose,
@@ -86,9 +94,8 @@ def sample_local(
         cells: Cells a side: 36 for the performance predictor, 52 for the pile state predictor.
         displacement: How far the map begins before the dig location [m].
     """
-    along, left = (jnp.asarray(a, pile.height.dtype) for a in local_axes(cells, displacement))
-    along, left = jnp.meshgrid(along, left, indexing="ij")
-    height = kept(sample(pile.height, pile, *to_world(pose, along, left)), pile.height[0, 0])
+    points = local_points(pose, cells, displacement, pile.height.dtype)
+    height = kept(sample(pile.height, pile, *points), pile.height[0, 0])
     first = sample(pile.height, pile, *to_world(pose, jnp.asarray(-displacement), jnp.asarray(0.0)))
     return LocalHeightmap(height - first, CELL_SIZE, displacement)
 

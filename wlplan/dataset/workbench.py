@@ -21,10 +21,9 @@ from wlplan.dataset.variables import LOADS, VARIABLES
 from wlplan.heightmap import (
     STATE_CELLS,
     STATE_DISPLACEMENT,
-    local_axes,
+    local_points,
     sample,
     sample_local,
-    to_world,
 )
 from wlplan.simulator import Simulator
 from wlplan.simulator.cycle import State, advance, begin, outcome
@@ -233,8 +232,7 @@ def _leave(
     after, performance = simulator.leave(pile, dig_pose, view, cycle)
     h36 = sample_local(pile, dig_pose)
     h52 = sample_local(pile, dig_pose, cells=STATE_CELLS, displacement=STATE_DISPLACEMENT).height
-    axes = (jnp.asarray(a, height.dtype) for a in local_axes(STATE_CELLS, STATE_DISPLACEMENT))
-    points = to_world(dig_pose, *jnp.meshgrid(*axes, indexing="ij"))
+    points = local_points(dig_pose, STATE_CELLS, STATE_DISPLACEMENT, height.dtype)
     record = {
         "mass": performance.mass,
         "time": performance.time,

@@ -13,9 +13,8 @@ from wlplan.heightmap import (
     STATE_CELLS,
     STATE_DISPLACEMENT,
     add_local_change,
-    local_axes,
+    local_points,
     sample,
-    to_world,
 )
 from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
 from wlplan.simulator.cycle import Cycle, Settings, dig
@@ -66,10 +65,7 @@ class Simulator(struct.PyTreeNode):
     def view(self, pile: Pile, pose: Pose) -> tuple[Float[Array, "52 52"], Float[Array, "52 52"]]:
         """Surface and floor in the local frame of a dig pose, over the floor there [m]."""
         window, _ = window_of(pile, pose)
-        axes = (
-            jnp.asarray(a, pile.height.dtype) for a in local_axes(STATE_CELLS, STATE_DISPLACEMENT)
-        )
-        points = to_world(pose, *jnp.meshgrid(*axes, indexing="ij"))
+        points = local_points(pose, STATE_CELLS, STATE_DISPLACEMENT, pile.height.dtype)
         if window.ground is None:
             height = sample(window.height, window, *points)
             return height, jnp.zeros_like(height)

@@ -1,0 +1,85 @@
+"""Paper: colours, figures, axes, and PNG files."""
+
+from __future__ import annotations
+
+import io
+import os
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from wlplan.io import write_bytes_atomic
+
+# Colours that people with the common kinds of colour blindness tell apart.
+INK = "#1d2733"
+FAINT = "#6b7785"
+BLUE = "#1f5fa8"
+ORANGE = "#d9700a"
+# Width of one map on paper [inch].
+PANEL_WIDTH = 5.6
+
+
+def png_bytes(figure: Figure, *, dpi: int = 150) -> bytes:
+    """A figure as the content of a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(
+        buffer,
+        format="png",
+        dpi=dpi,
+        bbox_inches="tight",
+        pad_inches=0.12,
+        metadata={"Software": None},
+    )
+    return buffer.getvalue()
+
+
+def save_figure(path: str | os.PathLike[str], figure: Figure, *, dpi: int = 150) -> None:
+    """Write a figure as PNG, in one piece or not at all.
+
+    Raises:
+        InputError: If the file cannot be written.
+    """
+    write_bytes_atomic(path, png_bytes(figure, dpi=dpi))
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure [inch] that is not known to pyplot."""
+    figure = Figure(figsize=(width, height), layout="compressed", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def map_panels(view: Float[np.ndarray, "2 2"], count: int) -> tuple[Figure, list[Axes]]:
+    """A row of panels that fit a view."""
+    size = np.ptp(view, axis=0)
+    figure = new_figure(count * PANEL_WIDTH + 1.0, PANEL_WIDTH * float(size[1] / size[0]) + 1.0)
+    return figure, list(np.atleast_1d(figure.subplots(1, count)))
+
+
+def frame_map(panel: Axes, view: Float[np.ndarray, "2 2"], title: str) -> None:
+    """Limits, labels and title of a map [m]."""
+    panel.set_xlim(view[0, 0], view[1, 0])
+    panel.set_ylim(view[0, 1], view[1, 1])
+    panel.set_aspect("equal")
+    panel.set_title(title, color=INK, fontsize=11)
+    panel.set_xlabel("x, east [m]")
+    panel.set_ylabel("y, north [m]")
+    panel.set_facecolor("white")
+    tidy(panel, grid=False)
+
+
+def tidy(panel: Axes, *, grid: bool = True) -> None:
+    """Axes without what distracts from the data."""
+    for name, spine in panel.spines.items():
+        spine.set_color("#b4bac1")
+        if grid and name in ("top", "right"):
+            spine.set_visible(False)
+    panel.tick_params(colors=FAINT, labelsize=8.5, length=3)
+    panel.xaxis.label.set_color(INK)
+    panel.yaxis.label.set_color(INK)
+    if grid:
+        panel.grid(True, axis="y", color="#e4e7ea", linewidth=0.8)
+        panel.set_axisbelow(True)
