@@ -23,6 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from wlplan.automaton import FLOW_FRACTION
+from wlplan.automaton.neighbours import NEIGHBOURS
 from wlplan.compilation import stored
 from wlplan.heightmap import STATE_CELLS, STATE_DISPLACEMENT, local_axes
 from wlplan.machine import Soil, WheelLoader
@@ -31,8 +32,6 @@ from wlplan.units import CELL_SIZE, GRAVITY
 
 _ALONG, _LEFT = local_axes(STATE_CELLS, STATE_DISPLACEMENT)
 _CELL_AREA = CELL_SIZE**2
-# Offsets of the neighbours of a cell.
-_NEIGHBOURS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
 
 # Where the surface ahead of the edge is read, and over which distance its slope is taken [m].
 _AHEAD, _SLOPE_LENGTH = 0.2, 0.8
@@ -303,7 +302,7 @@ def _outflow(surface: Array, giving: Array, drop: float, largest: float) -> Arra
     """
     here, gives = _shifted(surface, 0, 0), _shifted(giving, 0, 0)
     outflow = jnp.zeros_like(here)
-    for i, j in _NEIGHBOURS:
+    for i, j in NEIGHBOURS:
         difference, stable = here - _shifted(surface, i, j), drop * math.hypot(i, j)
         flow = difference - jnp.clip(difference, -stable, stable)
         flow = jnp.clip(flow, -largest, largest)
