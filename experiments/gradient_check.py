@@ -33,18 +33,18 @@ def draw(folder: Path) -> None:
     from matplotlib.figure import Figure
 
     result = json.loads((folder / "gradient_check.json").read_text())
-    figure = Figure(figsize=(5.6, 3.4), layout="constrained")
+    figure = Figure(figsize=(6.4, 3.4), layout="constrained")
     axis = figure.subplots()
     for name in COMPONENTS:
         rows = [row for row in result["rows"] if row["component"] == name]
         rows = [row for row in rows if row["verdict"] != "kink"]
         errors = [max(row["relative_error"], 1e-14) for row in rows]
         axis.semilogy([row["load"] for row in rows], errors, "o", ms=4, label=name)
-    axis.axhline(TOLERANCE, color="#999999", lw=1)
+    axis.axhline(TOLERANCE, color="#999999", lw=1, label="tolerance")
     axis.set_xticks(range(1, result["loads"] + 1))
     axis.set_xlabel("load")
     axis.set_ylabel("relative error of the gradient")
-    axis.legend(frameon=False, ncols=2, fontsize=8)
+    figure.legend(loc="outside right upper", frameon=False, fontsize=8)
     write_bytes_atomic(folder / "gradient_check.png", png_bytes(figure))
 
 
