@@ -36,7 +36,6 @@ MACHINE = dataclasses.replace(
     boom_speed=0.23,
     tilt_speed=0.55,
     tilt_moment=220e3,
-    bucket_heaped=3.05,
 )
 
 

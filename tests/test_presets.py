@@ -28,12 +28,11 @@ from wlplan.types import Action
 from wlplan.units import CELL_SIZE
 
 FITTED = (
-    *("force_scale", "wall_inclination", "wall_fullness", "edge_resistance", "edge_bearing"),
-    "slide_rate",
+    *("edge_resistance", "content_push", "content_carry", "intrusion_stiffness", "slide_rate"),
 )
 SOIL_FIELDS = [field.name for field in dataclasses.fields(Soil)]
 MACHINE_FIELDS = [field.name for field in dataclasses.fields(WheelLoader)]
-ANGLES = ("friction", "steel_friction", "wall_inclination")
+ANGLES = ("friction", "steel_friction")
 MACHINE_ANGLES = ("boom_low", "boom_carry", "boom_high", "tilt_end", "boom_speed", "tilt_speed")
 
 
@@ -169,7 +168,7 @@ def test_the_ends_of_a_range_count_as_inside(write):
         ("cohesion = -1", ["cohesion is -1 Pa"]),
         ("steel_friction_deg = 40", ["steel_friction_deg is 40°", "friction_deg, 32°"]),
         ("adhesion = 10", ["adhesion is 10 Pa", "cohesion, 0 Pa"]),
-        ("wall_fullness = 0", ["wall_fullness"]),
+        ("content_push = -1", ["content_push"]),
         ("densty = 1600", ["densty", "density"]),
         ("density_deg = 1600", ["density_deg", "density"]),
         ("frction = 30", ["frction", "friction_deg"]),

@@ -41,6 +41,11 @@ class WheelLoader:
     # Length of the bucket floor from the cutting edge to the back wall [m]. Estimate from the
     # brochure's side view.
     bucket_depth: float = 1.10
+    # Thickness of the floor plate and the edge [m]. Estimate: plate, wear plates and edge.
+    plate_thickness: float = 0.03
+    # Height of the side plates over the floor, mean over their length [m]. Estimate from the
+    # brochure's side view.
+    side_height: float = 0.85
     # Heaped volume [m^3]. Estimate: about 3 by the brochure, less here so that the fullest load,
     # 4.8 t of gravel, comes near the largest of the paper's data set, 4.5 t (its appendix A).
     bucket_heaped: float = 2.8
@@ -85,17 +90,15 @@ class Soil:
     adhesion: float = 0.0
 
     # Fitted to the forces and loads of discrete-element cycles, see docs/simulator.md.
-    # Factor on the earthmoving force [1].
-    force_scale: float = 0.9
-    # Inclination of the wedge of soil that rests against the bucket's back wall and acts as the
-    # blade once the bucket is full [rad].
-    wall_inclination: float = math.radians(53.0)
-    # Fullness of the bucket at which that wedge is complete [1].
-    wall_fullness: float = 0.25
-    # Resistance to the cutting edge a metre of width: at the surface [N/m] and as a multiple of
-    # the overburden pressure at its depth [m].
-    edge_resistance: float = 8_000.0
-    edge_bearing: float = 0.33
+    # Resistance to the cutting edge a metre of width [N/m].
+    edge_resistance: float = 4_500.0
+    # Push of a level bucket's content against the pile ahead, and weight of the soil that is
+    # carried with the content, both over the content's weight [1].
+    content_push: float = 2.35
+    content_carry: float = 0.5
+    # Resistance of the soil under the bucket's floor to being pressed down, a square metre and a
+    # metre of depth [N/m^3].
+    intrusion_stiffness: float = 1.2e6
     # Fastest flow of sliding soil a metre of width while the bucket digs [m^2/s].
     slide_rate: float = 0.03
 

@@ -70,12 +70,10 @@ _SOIL_RANGES = {
     "cohesion": _Range(0.0, 100e3, "Pa"),
     "steel_friction": _Range(0.0, 60.0, "°"),
     "adhesion": _Range(0.0, 100e3, "Pa"),
-    "force_scale": _Range(0.1, 10.0, ""),
-    # Rake angles for which the failure wedge makes sense.
-    "wall_inclination": _Range(12.0, 80.0, "°"),
-    "wall_fullness": _Range(0.01, 1.0, ""),
     "edge_resistance": _Range(0.0, 1e6, "N/m"),
-    "edge_bearing": _Range(0.0, 100.0, "m"),
+    "content_push": _Range(0.0, 20.0, ""),
+    "content_carry": _Range(0.0, 20.0, ""),
+    "intrusion_stiffness": _Range(0.0, 1e8, "N/m³"),
     "slide_rate": _Range(0.0, 1.0, "m²/s"),
 }
 _MACHINE_RANGES = {
@@ -95,6 +93,8 @@ _MACHINE_RANGES = {
     # Half a metre is five lanes; the widest fills the local map from side to side.
     "bucket_width": _Range(0.5, MAP_WIDTH, "m"),
     "bucket_depth": _Range(0.2, 4.0, "m"),
+    "side_height": _Range(0.05, 5.0, "m"),
+    "plate_thickness": _Range(0.0, 0.5, "m"),
     "bucket_heaped": _Range(0.05, 30.0, "m³"),
     "pivot_height": _Range(0.3, 6.0, "m"),
     "boom_length": _Range(0.5, 10.0, "m"),
@@ -151,8 +151,7 @@ def soil_named(name_or_path: str | os.PathLike[str]) -> Soil:
 
     Args:
         name_or_path: A name of `SOILS`, or the path of a file whose keys are fields of `Soil`: SI
-            units, and angles in degrees as `friction_deg`, `steel_friction_deg` and
-            `wall_inclination_deg`. `preset` names the soil that fields left out come from, by
+            units, and angles in degrees as `friction_deg` and `steel_friction_deg`. `preset` names the soil that fields left out come from, by
             default gravel. A preset goes before a file of the same name: write `./sand` for that.
 
     Returns:

@@ -206,14 +206,15 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     wanted = ~state.has_ended.all()
     x, z = loader.bucket_tip(machine, state.position, state.boom, state.tilt)
     bucket = terrain.Bucket(x, z, state.tilt)
-    soil_force = terrain.reaction(machine, soil, state.height, state.fill, bucket, wanted)
+    soil_force = terrain.reaction(
+        machine, soil, state.height, state.ground, state.fill, bucket, wanted
+    )
     soil_force = stored(soil_force, wanted)
-    load = soil_force.content_mass * GRAVITY
     vertical = soil_force.vertical
 
     # Vehicle: thrust while filling, brake after the stop. The soil can stop it, not push it back.
     total = machine.mass + soil_force.content_mass
-    thrust, slip = loader.drive(machine, state.speed, vertical + load)
+    thrust, slip = loader.drive(machine, state.speed, vertical)
     brake = machine.traction * total * GRAVITY
     rolling = machine.rolling_resistance * total * GRAVITY
     thrust = jnp.where(filling, thrust, 0.0)
@@ -224,7 +225,7 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     speed = jnp.maximum(state.speed + (thrust - passive - horizontal) / total * step, 0.0)
 
     # Controller and actuators.
-    force = loader.boom_force(machine, state.boom, vertical + load, horizontal)
+    force = loader.boom_force(machine, state.boom, vertical, horizontal)
     boom_force = controller.smooth(state.boom_force, force / machine.boom_force_nominal, step)
     boom_target, tilt_target = controller.command(state.action, boom_force)
     # Engaged when the edge reaches the dig location; a short ramp keeps this continuous.
@@ -233,7 +234,7 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     tilt_target = jnp.where(filling, engaged * tilt_target, 1.0)
     boom_command = controller.smooth(state.boom_command, boom_target, step)
     tilt_command = controller.smooth(state.tilt_command, tilt_target, step)
-    moment = loader.tilt_moment(machine, state.tilt, load, vertical, horizontal)
+    moment = loader.tilt_moment(machine, state.tilt, vertical, horizontal, soil_force.moment)
     boom_rate = machine.boom_speed * boom_command * loader.actuator_speed(force, machine.boom_force)
     tilt_rate = (
         machine.tilt_speed * tilt_command * loader.actuator_speed(moment, machine.tilt_moment)

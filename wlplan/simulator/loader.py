@@ -69,29 +69,25 @@ def boom_force(
 def tilt_moment(
     machine: WheelLoader,
     tilt: Float[Array, "*b"],
-    load: Float[Array, "*b"],
     vertical: Float[Array, "*b"],
     horizontal: Float[Array, "*b"],
+    moment: Float[Array, "*b"],
 ) -> Float[Array, "*b"]:
     """Moment that the bucket cylinder must overcome to tilt back [N m].
 
     Args:
         machine: Machine parameters.
         tilt: Bucket angle over level [rad].
-        load: Weight of the soil in the bucket [N].
-        vertical: Downward dig force at the cutting edge [N].
-        horizontal: Dig force against the direction of travel at the cutting edge [N].
+        vertical: Downward force of the soil on the bucket [N].
+        horizontal: Force of the soil against the direction of travel [N].
+        moment: Moment of these forces about the cutting edge, against tilting back [N m].
     """
     forward, down = tip_arm(machine)
     c, s = jnp.cos(tilt), jnp.sin(tilt)
     edge_x, edge_z = c * forward + s * down, s * forward - c * down
-    # Soil and bucket weigh on the middle of the floor.
-    middle = 0.5 * machine.bucket_depth
-    return (
-        (load + machine.bucket_mass * GRAVITY) * (edge_x - middle * c)
-        + vertical * edge_x
-        - horizontal * edge_z
-    )
+    # The bucket weighs on the middle of its floor.
+    own = machine.bucket_mass * GRAVITY * (edge_x - 0.5 * machine.bucket_depth * c)
+    return own + vertical * edge_x - horizontal * edge_z + moment
 
 
 def actuator_speed(load: Float[Array, "*b"], stall: float) -> Float[Array, "*b"]:

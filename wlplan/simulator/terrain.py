@@ -35,6 +35,8 @@ _CELL_AREA = CELL_SIZE**2
 
 # Where the surface ahead of the edge is read, and over which distance its slope is taken [m].
 _AHEAD, _SLOPE_LENGTH = 0.2, 0.8
+# Depth from which on the whole edge is in the soil [m].
+_EDGE_DEPTH = 0.1
 # Distance on either side over which the surface is averaged where it is read [m].
 _READ_LENGTH = 0.2
 # Rake angles and slopes for which the failure wedge makes sense [rad].
@@ -44,6 +46,8 @@ _LEAST_SLOPE, _GREATEST_SLOPE = math.radians(-10.0), math.radians(35.0)
 _SLIDE_TIME = 0.02
 # Soil pushed out of the bucket is laid down over this distance ahead of the edge [m].
 _PUSH_LENGTH = 0.7
+# and this far to the left and right of its lane [m].
+_PUSH_WIDTH = 1.0
 
 
 class Bucket(NamedTuple):
@@ -55,10 +59,11 @@ class Bucket(NamedTuple):
 
 
 class Reaction(NamedTuple):
-    """Forces of the soil on the bucket."""
+    """Forces of the soil on the bucket, the weight of what lies in it included."""
 
     horizontal: Float[Array, " b"]  # against the direction of travel [N]
-    vertical: Float[Array, " b"]  # downward at the cutting edge, without the content's weight [N]
+    vertical: Float[Array, " b"]  # downward [N]
+    moment: Float[Array, " b"]  # about the cutting edge, against tilting back [N m]
     content_mass: Float[Array, " b"]  # soil in the bucket [kg]
 
 
@@ -89,6 +94,12 @@ class Lanes:
     def spread(self, values: Float[Array, "lanes b"]) -> Float[Array, "m b"]:
         """One value a lane as one a column of a heightfield with a rim, 0 beside the bucket."""
         return jnp.pad(values, ((1 + self.first, 1 + STATE_CELLS - self.end), (0, 0)))
+
+
+    def beside(self, values: Float[Array, "2 b"]) -> Float[Array, "1 m b"]:
+        """One value a side as one a column of a heightfield with a rim, just beside the bucket."""
+        columns = jnp.zeros((1, STATE_CELLS + 2, values.shape[1]), values.dtype)
+        return columns.at[0, self.first].set(values[0]).at[0, self.end + 1].set(values[1])
 
 
 def rimmed(field: Float[Array, "n m b"]) -> Float[Array, "i j b"]:
@@ -138,16 +149,22 @@ def reaction(
     machine: WheelLoader,
     soil: Soil,
     height: Float[Array, "n n b"],
+    ground: Float[Array, "n n b"],
     fill: Float[Array, "lanes b"],
     bucket: Bucket,
     wanted: Bool[Array, ""],
 ) -> Reaction:
     """Resistance that the soil would put up against the bucket moving forward.
 
+    It is the sum of four: the edge and the open part of the floor cut, lane by lane; the content is
+    pushed against the pile ahead and carries soil on top and at its back with it; it rubs on the
+    floor, and with it the side plates; and what lies under the floor bears it.
+
     Args:
         machine: Machine parameters.
         soil: Soil parameters.
         height: Local heightfield with its rim, ground at the dig location at 0 [m].
+        ground: Floor under the pile, with its rim [m].
         fill: Volume of soil in each lane of the bucket [m^3].
         bucket: Pose of the bucket.
         wanted: False where no result is wanted.
@@ -160,30 +177,76 @@ def reaction(
     near, far = stored((near, far), wanted)
     depth = jnp.maximum(near - bucket.z[None], 0.0)
     slope = jnp.clip(jnp.arctan((far - near) / _SLOPE_LENGTH), _LEAST_SLOPE, _GREATEST_SLOPE)
-    # An empty bucket cuts with its floor; a full one pushes with the wedge at its back wall.
-    full = jnp.clip(fullness(machine, fill) / soil.wall_fullness, 0.0, 1.0)
-    full = full**2 * (3.0 - 2.0 * full)
-    floor = bucket.tilt[None]
-    blade = floor + jnp.maximum(soil.wall_inclination - floor, 0.0) * full
-    friction = soil.steel_friction + (soil.friction - soil.steel_friction) * full
-    rake = jnp.clip(blade + slope, _LEAST_RAKE, _GREATEST_RAKE)
-    pushed = blade + friction
-    wedge = wedge_of(depth * jnp.cos(slope), rake, slope, friction, soil=soil)
-    across = jnp.sin(pushed), jnp.cos(pushed)
-    depth, across, wedge = stored((depth, across, wedge), wanted)
-    force = soil.force_scale * least_resistance(wedge, soil=soil)
-    weight = soil.density * GRAVITY
-    edge = soil.edge_resistance * jnp.clip(depth / 0.1, 0.0, 1.0)
-    edge = edge + soil.edge_bearing * weight * depth
+    # Soil in a lane covers the floor that would cut.
+    bare = jnp.maximum(1.0 - fullness(machine, fill), 0.0)
+    rake = jnp.clip(bucket.tilt[None] + slope, _LEAST_RAKE, _GREATEST_RAKE)
+    pressed = bucket.tilt + soil.steel_friction
+    wedge = wedge_of(depth * jnp.cos(slope), rake, slope, soil.steel_friction, soil=soil)
+    wedge, bare, depth = stored((wedge, bare, depth), wanted)
+    cutting = total(width * bare * least_resistance(wedge, soil=soil))
+    edge = soil.edge_resistance * total(width * jnp.clip(depth / _EDGE_DEPTH, 0.0, 1.0))
+
     content = total(fill) * soil.density
-    # Both side plates: earth pressure at rest, and friction.
-    middle = total(width * depth) / machine.bucket_width
-    sides = (1.0 - math.sin(soil.friction)) * weight * middle**2 * machine.bucket_depth
-    horizontal = total(width * (force * across[0] + edge)) + math.tan(soil.steel_friction) * (
-        content * GRAVITY + sides
+    load = content * GRAVITY
+    # As the bucket tilts back its mouth turns upward, and the content is pushed less.
+    push = soil.content_push * load * (1.0 - jnp.sin(bucket.tilt))
+    carried = soil.content_carry * load
+    bearing, bearing_moment = _bearing(machine, soil, lanes, met, lanes.of(ground), bucket)
+
+    sine, cosine = jnp.sin(bucket.tilt), jnp.cos(bucket.tilt)
+    rubbing = math.tan(soil.steel_friction)
+    middle = machine.bucket_depth / 2
+    thickness = content / (soil.density * machine.bucket_depth * machine.bucket_width)
+    return Reaction(
+        horizontal=cutting * jnp.sin(pressed)
+        + edge
+        + push
+        + rubbing * load
+        + (sine / cosine + rubbing) * bearing,
+        vertical=cutting * jnp.cos(pressed) + load + carried - bearing,
+        # The push acts at the middle of the content, its weight there too, what it carries at the
+        # back wall.
+        moment=bearing_moment
+        - (load + 2.0 * carried) * middle * cosine
+        - push * (thickness / 2 * cosine - middle * sine),
+        content_mass=content,
     )
-    vertical = total(width * force * across[1])
-    return Reaction(horizontal, vertical, content)
+
+
+def _bearing(
+    machine: WheelLoader,
+    soil: Soil,
+    lanes: Lanes,
+    height: Float[Array, "n lanes b"],
+    ground: Float[Array, "n lanes b"],
+    bucket: Bucket,
+) -> tuple[Float[Array, " b"], Float[Array, " b"]]:
+    """Thrust of the soil under the bucket's floor [N] and its moment about the edge [N m].
+
+    The edge cuts along its path. Where the floor behind it comes lower than this path, because the
+    bucket is tilted more than the path is steep, it sinks into what was left standing, and the soil
+    resists in proportion to the depth (resistive force theory, Li et al. 2013). The plate's
+    thickness counts: a level floor that moves level rests on the soil it has cut.
+    """
+    count = math.ceil(machine.bucket_depth / CELL_SIZE)
+    last = jnp.floor((bucket.x - _ALONG[0]) / CELL_SIZE - 0.5).astype(jnp.int32)
+    rows = last[None] - jnp.arange(count, dtype=jnp.int32)[:, None]
+    rows = jnp.clip(rows, 0, STATE_CELLS - 1)
+    behind = bucket.x[None] - jnp.asarray(_ALONG, height.dtype)[rows]
+    length = machine.bucket_depth * jnp.cos(bucket.tilt)[None]
+    # Cells that the edge has passed whole, up to the back wall.
+    under = jnp.clip(behind / CELL_SIZE - 0.5, 0.0, 1.0) * jnp.clip(
+        (length - behind) / CELL_SIZE + 0.5, 0.0, 1.0
+    )
+    floor = bucket.z[None] - behind * jnp.tan(bucket.tilt)[None] - machine.plate_thickness
+    surface = jnp.take_along_axis(height, rows[:, None], axis=0)
+    lowest = jnp.take_along_axis(ground, rows[:, None], axis=0)
+    sunk = jnp.clip(surface - floor[:, None], 0.0, jnp.maximum(surface - lowest, 0.0))
+    width = jnp.asarray(lanes.width, height.dtype)
+    thrust = total(jnp.moveaxis(sunk * width[None], 1, 0)) * under
+    stiffness = soil.intrusion_stiffness * (1.0 - jnp.sin(bucket.tilt))
+    thrust = stiffness[None] * CELL_SIZE * thrust
+    return total(thrust), total(thrust * behind)
 
 
 def move(
@@ -241,7 +304,8 @@ def move(
     swept = total(lanes.of(cut)) * _CELL_AREA
     pushed = (1.0 - open_part) * swept
     swept, pushed = stored((swept, pushed), wanted)
-    height = height - cut + laid[:, None] * lanes.spread(pushed / _CELL_AREA)[None]
+    aside = jnp.asarray(_aside(lanes), dtype)
+    height = height - cut + laid[:, None] * (aside @ (pushed / _CELL_AREA))[None]
     fill = fill + swept - pushed
 
     # Soil slides. Cells inside the bucket stand at the level of its mouth: empty, that is the
@@ -274,8 +338,20 @@ def move(
     taken = _shifted(occupied, 0, 0) * lanes.spread(open_part)[None, 1:-1] * gain
     slid = _with_rim(_shifted(height, 0, 0) + change - taken)
 
-    # Inside the bucket the lanes level out at the angle of repose, like the terrain.
-    return slid, fill - share * _lane_outflow(fill, lanes.width, machine, soil)
+    # Inside the bucket the lanes level out at the angle of repose, like the terrain, and what
+    # stands higher than the side plates falls off to the ground beside them.
+    over = share * _over_the_sides(fill, lanes.width, machine)
+    fill = fill - share * _lane_outflow(fill, lanes.width, machine, soil) - _at_ends(over, fill)
+    beside = lanes.beside(over / _CELL_AREA) * (inside / jnp.maximum(total(inside), 1e-6))[:, None]
+    return slid + beside, fill
+
+
+def _aside(lanes: Lanes) -> np.ndarray:
+    """What of the soil pushed out of a lane is laid down in each column, the rim at zero."""
+    column = np.arange(STATE_CELLS)[:, None]
+    lane = np.arange(lanes.first, lanes.end)[None]
+    reach = np.maximum(1.0 - np.abs(column - lane) * CELL_SIZE / _PUSH_WIDTH, 0.0)
+    return np.pad(reach / reach.sum(axis=0), ((1, 1), (0, 0)))
 
 
 def _shifted(field: Array, i: int, j: int) -> Array:
@@ -308,6 +384,18 @@ def _outflow(surface: Array, giving: Array, drop: float, largest: float) -> Arra
         flow = jnp.clip(flow, -largest, largest)
         outflow = outflow + flow * jnp.where(flow > 0.0, gives, _shifted(giving, i, j))
     return outflow
+
+
+def _over_the_sides(fill: Array, width: np.ndarray, machine: WheelLoader) -> Array:
+    """What falls from the first and the last lane over the side plates in a sweep [m^3]."""
+    ends = np.array([0, -1])
+    area = jnp.asarray(_least(width)[ends] * machine.bucket_depth, fill.dtype)
+    above = jnp.maximum(fill[ends] / area - machine.side_height, 0.0)
+    return FLOW_FRACTION * area * above
+
+
+def _at_ends(values: Float[Array, "2 b"], fill: Float[Array, "lanes b"]) -> Array:
+    return jnp.zeros_like(fill).at[0].set(values[0]).at[-1].set(values[1])
 
 
 def _lane_outflow(fill: Array, width: np.ndarray, machine: WheelLoader, soil: Soil) -> Array:
