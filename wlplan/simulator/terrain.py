@@ -95,11 +95,12 @@ class Lanes:
         """One value a lane as one a column of a heightfield with a rim, 0 beside the bucket."""
         return jnp.pad(values, ((1 + self.first, 1 + STATE_CELLS - self.end), (0, 0)))
 
-
     def beside(self, values: Float[Array, "2 b"]) -> Float[Array, "1 m b"]:
         """One value a side as one a column of a heightfield with a rim, just beside the bucket."""
+        # A bucket as wide as the map has no column beside it: what falls stays in its own.
+        right, left = max(self.first, 1), min(self.end + 1, STATE_CELLS)
         columns = jnp.zeros((1, STATE_CELLS + 2, values.shape[1]), values.dtype)
-        return columns.at[0, self.first].set(values[0]).at[0, self.end + 1].set(values[1])
+        return columns.at[0, right].set(values[0]).at[0, left].set(values[1])
 
 
 def rimmed(field: Float[Array, "n m b"]) -> Float[Array, "i j b"]:
@@ -341,9 +342,10 @@ def move(
     # Inside the bucket the lanes level out at the angle of repose, like the terrain, and what
     # stands higher than the side plates falls off to the ground beside them.
     over = share * _over_the_sides(fill, lanes.width, machine)
-    fill = fill - share * _lane_outflow(fill, lanes.width, machine, soil) - _at_ends(over, fill)
-    beside = lanes.beside(over / _CELL_AREA) * (inside / jnp.maximum(total(inside), 1e-6))[:, None]
-    return slid + beside, fill
+    fill = fill - share * _lane_outflow(fill, lanes.width, machine, soil)
+    fill = fill.at[0].add(-over[0]).at[-1].add(-over[1])
+    along_sides = inside / jnp.maximum(total(inside[1:-1]), 1e-6)[None]
+    return slid + along_sides[:, None] * lanes.beside(over / _CELL_AREA), fill
 
 
 def _aside(lanes: Lanes) -> np.ndarray:
@@ -392,10 +394,6 @@ def _over_the_sides(fill: Array, width: np.ndarray, machine: WheelLoader) -> Arr
     area = jnp.asarray(_least(width)[ends] * machine.bucket_depth, fill.dtype)
     above = jnp.maximum(fill[ends] / area - machine.side_height, 0.0)
     return FLOW_FRACTION * area * above
-
-
-def _at_ends(values: Float[Array, "2 b"], fill: Float[Array, "lanes b"]) -> Array:
-    return jnp.zeros_like(fill).at[0].set(values[0]).at[-1].set(values[1])
 
 
 def _lane_outflow(fill: Array, width: np.ndarray, machine: WheelLoader, soil: Soil) -> Array:
