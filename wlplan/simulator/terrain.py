@@ -47,7 +47,7 @@ _SLIDE_TIME = 0.02
 # Soil pushed out of the bucket is laid down over this distance ahead of the edge [m].
 _PUSH_LENGTH = 0.7
 # and this far to the left and right of its lane [m].
-_PUSH_WIDTH = 1.0
+_PUSH_WIDTH = 2.0
 
 
 class Bucket(NamedTuple):
