@@ -383,7 +383,11 @@ def _dig_recorded(
         def step(s: State, _: None) -> tuple[State, None]:
             return _step(s, machine, soil, settings.step), None
 
-        return lax.scan(step, state, None, length=chunk)[0], None
+        def steps(state: State) -> State:
+            return lax.scan(step, state, None, length=chunk)[0]
+
+        # When all have ended there is nothing left to do, nor to go back through.
+        return lax.cond(state.has_ended.all(), lambda s: s, steps, state), None
 
     state = begin(height, ground, action, machine)
     state, _ = lax.scan(advance_chunk, state, None, length=chunk)
