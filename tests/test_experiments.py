@@ -13,7 +13,9 @@ import experiments
 
 ROOT = Path(__file__).parents[1]
 NAMES = sorted(
-    module.name for module in pkgutil.iter_modules(experiments.__path__) if module.name != "record"
+    module.name
+    for module in pkgutil.iter_modules(experiments.__path__)
+    if module.name not in ("record", "replays")
 )
 
 
