@@ -43,6 +43,13 @@ SHAPES = {
     "concave": (25.0, 0.0, -0.08, -0.08),
     "aslant": (25.0, 35.0, 0.0, 0.0),
 }
+# Not drawn: which of the two curvatures does what.
+APART = {
+    "convex along": (25.0, 0.0, 0.08, 0.0),
+    "convex across": (25.0, 0.0, 0.0, 0.08),
+    "concave along": (25.0, 0.0, -0.08, 0.0),
+    "concave across": (25.0, 0.0, 0.0, -0.08),
+}
 # Values of the bucket's threshold and gain each; those of the boom.
 POINTS = 21
 BOOM = (0.5 * ACTION_HIGH[0], 0.5 * ACTION_HIGH[1])
@@ -77,7 +84,8 @@ def run(preset: str) -> dict[str, Any]:
     thresholds, gains = (np.linspace(0.0, ACTION_HIGH[k], points) for k in (2, 3))
     grid = np.stack(np.meshgrid(thresholds, gains, indexing="ij"), axis=-1).reshape(-1, 2)
     actions = np.concatenate([np.tile(BOOM, (len(grid), 1)), grid], axis=1)
-    surfaces = np.array([surface(*shape) for shape in SHAPES.values()])
+    shapes = SHAPES | APART
+    surfaces = np.array([surface(*shape) for shape in shapes.values()])
     cycle = in_batches(
         lambda *inputs: dig(*inputs, settings=Settings()).replace(height=0.0),
         np.repeat(surfaces, len(grid), axis=0),
@@ -91,7 +99,7 @@ def run(preset: str) -> dict[str, Any]:
         "work": work / J_PER_KJ,
         "productivity": 60.0 * mass / cycle.time,
     }
-    found = {name: values.reshape(len(SHAPES), points, points) for name, values in table.items()}
+    found = {name: values.reshape(len(shapes), points, points) for name, values in table.items()}
     return {
         "shapes": {
             name: _described(surfaces[k], {o: v[k] for o, v in found.items()}, thresholds, gains)
@@ -106,7 +114,7 @@ def run(preset: str) -> dict[str, Any]:
                 }
                 for outcome, values in found.items()
             }
-            for k, name in enumerate(SHAPES)
+            for k, name in enumerate(shapes)
             if k > 0
         },
         "boom": {"delta_bm": BOOM[0], "k_bm": BOOM[1]},
