@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import experiments
-from experiments import action_landscape, dataset_overview, simulator_gradients
+from experiments import action_landscape, dataset_overview, record, simulator_gradients
 from wlplan.characteristics import as_vector, characteristics
 from wlplan.types import LocalHeightmap
 
@@ -97,3 +97,16 @@ def test_the_summary_of_gradients_can_fail():
     assert some["cycles"] == 49
     assert some["p10"] == pytest.approx(-1.0)
     assert some["median"] == pytest.approx(1.0)
+
+
+def test_what_is_no_data_set_is_said_in_one_line(tmp_path, monkeypatch, capsys):
+    (tmp_path / "note.txt").write_text("keep me")
+    arguments = ["--data", str(tmp_path / "note.txt"), "--out", str(tmp_path / "results")]
+    monkeypatch.setattr(sys, "argv", ["dataset_overview", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        record.main("dataset_overview", dataset_overview.run, dataset_overview.draw)
+    assert ended.value.code == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert said[-1].startswith("error: ")
+    assert "not a data set" in said[-1]
+    assert (tmp_path / "note.txt").read_text() == "keep me"
