@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import inspect
 import json
 import platform
+import sys
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -13,10 +16,15 @@ from typing import Any
 import jax
 
 from wlplan.compilation import cores
+from wlplan.dataset import Dataset, collect, fingerprint, open_dataset
+from wlplan.errors import InputError
 from wlplan.io import write_text_atomic
 
 RESULTS = Path(__file__).parent / "results"
 PRESETS = ("full", "smoke")
+# The data set of the experiments that need one: where it lies, and its cycles. Paper, section 6.2.
+DATA = Path("out") / "cycles.zarr"
+CYCLES, SMOKE_CYCLES = 10_800, 180
 
 
 def conditions() -> dict[str, Any]:
@@ -44,14 +52,60 @@ def write(name: str, preset: str, result: dict[str, Any], folder: Path) -> Path:
     return path
 
 
-def main(name: str, run: Callable[[str], dict[str, Any]], draw: Callable[[Path], None]) -> None:
-    """Command line of an experiment: run and draw, or draw again what is there."""
+def cycles_at(path: Path, preset: str) -> Dataset:
+    """The data set at a path; if it is missing or not finished, it is collected first.
+
+    Raises:
+        InputError: If there is something else, or a part of a collection of other settings.
+    """
+    with contextlib.suppress(InputError):
+        return open_dataset(path)
+    count = SMOKE_CYCLES if preset == "smoke" else CYCLES
+    print(f"collecting {count} cycles in {path}", file=sys.stderr)
+    collect(path, cycles=count)
+    return open_dataset(path)
+
+
+def described(data: Dataset) -> dict[str, Any]:
+    """Which data set a result is of."""
+    return {
+        "cycles": len(data),
+        "seed": data.attributes["seed"],
+        "versions": data.attributes["versions"],
+        "fingerprint": fingerprint(data),
+    }
+
+
+def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], None]) -> None:
+    """Command line of an experiment: run and draw, or draw again what is there.
+
+    Args:
+        name: Name of its module.
+        run: Function of the preset to the result; of a data set too if it has a parameter `data`.
+        draw: Draws the result that lies in a folder there.
+    """
+    needs_data = "data" in inspect.signature(run).parameters
     parser = argparse.ArgumentParser(prog=f"python -m experiments.{name}")
     parser.add_argument("--preset", choices=PRESETS, default="full")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of results")
     parser.add_argument("--draw", action="store_true", help="only draw what is there")
+    if needs_data:
+        parser.add_argument(
+            "--data",
+            type=Path,
+            help=f"data set; collected if it is not there (default {DATA}, for smoke a new one)",
+        )
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     if not options.draw:
-        write(name, options.preset, run(options.preset), options.out)
+        more = {}
+        if needs_data:
+            smoke = options.preset == "smoke"
+            path = options.data or (options.out / DATA.name if smoke else DATA)
+            try:
+                more["data"] = cycles_at(path, options.preset)
+            except InputError as error:
+                print(f"error: {error}", file=sys.stderr)
+                raise SystemExit(2) from error
+        write(name, options.preset, run(options.preset, **more), options.out)
     draw(options.out)

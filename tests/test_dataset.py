@@ -128,6 +128,14 @@ def numbered(rollouts, loads=3):
     return Dataset(**columns, attributes={})
 
 
+def forget(path, name):
+    """Takes a variable out of a store, as if it had never been there."""
+    shutil.rmtree(path / name)
+    document = json.loads((path / "zarr.json").read_text())
+    del document["consolidated_metadata"]["metadata"][name]
+    (path / "zarr.json").write_text(json.dumps(document))
+
+
 def refused(call, *words):
     with pytest.raises(InputError) as error:
         call()
@@ -175,6 +183,16 @@ def test_the_maps_begin_at_the_reference_and_the_change_is_local(data):
     assert np.abs(data.h52_after - data.h52).max() < 1.5
 
 
+def test_the_smaller_map_after_is_a_part_of_the_larger(data):
+    level = data.h36[:, 0, 0] - data.h52[:, 10, 8]
+    part = data.h52_after[:, 10:46, 8:44] + level[:, None, None]
+    np.testing.assert_allclose(data.h36_after, part, atol=1e-5)
+    np.testing.assert_allclose(data.h36, data.h52[:, 10:46, 8:44] + level[:, None, None], atol=1e-5)
+    # Most of the load comes from it.
+    lost = (data.h36 - data.h36_after).sum(axis=(1, 2)) * CELL_SIZE**2 * GRAVEL.density / 1000.0
+    assert np.median(lost / data.mass) > 0.6
+
+
 def test_the_volume_that_the_map_loses_is_about_the_load(data):
     lost = (data.h52 - data.h52_after).sum(axis=(1, 2)) * CELL_SIZE**2 * GRAVEL.density / 1000.0
     # Soil slides into the map from above it, so a part of the load shows outside.
@@ -215,6 +233,8 @@ def test_what_left_the_grid_is_the_load():
     got = record["h52_after"]
     offset = (got - want)[:4, :4].mean()  # at the level ground behind the dig location
     np.testing.assert_allclose(got - offset, want, atol=1e-4)
+    smaller = record["h36_after"] - sample_local(dug, where).height
+    np.testing.assert_allclose(smaller, smaller[0, 0], atol=1e-4)
 
 
 def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike():
@@ -276,6 +296,21 @@ def test_the_store_says_what_it_holds(store):
         assert array["attributes"]["units"] == variable.units
         assert array["attributes"]["long_name"]
     assert not store.with_name("data.zarr.lock").exists()
+
+
+def test_a_data_set_of_a_version_without_the_smaller_map_after_is_read(data, copy):
+    forget(copy, "h36_after")
+    earlier = open_dataset(copy)
+    np.testing.assert_allclose(earlier.h36_after, data.h36_after, atol=1e-6)
+    collect(copy, cycles=CYCLES, seed=SEED)
+    assert not (copy / "h36_after").exists()
+    stored.update_attributes(copy, {"cycles_done": 6})
+    refused(lambda: collect(copy, cycles=CYCLES, seed=SEED), "h36_after", "another version")
+
+
+def test_a_data_set_without_another_variable_is_damaged(copy):
+    forget(copy, "h52_after")
+    refused(lambda: open_dataset(copy), "damaged", "h52_after")
 
 
 # --- going on

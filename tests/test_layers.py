@@ -18,7 +18,7 @@ LAYERS = [
     *("automaton.neighbours", "automaton.slopes", "automaton.windows", "automaton.flow"),
     *("automaton.rounds", "automaton.relaxation", "automaton", "excavation"),
     *("simulator.controller", "simulator.soil", "simulator.loader", "simulator.terrain"),
-    *("simulator.cycle", "simulator.world", "simulator"),
+    *("simulator.cycle", "simulator.trajectory", "simulator.world", "simulator"),
     *("sampling", "dataset.variables", "dataset.protocol", "dataset.workbench", "dataset.store"),
     *("dataset.collecting", "dataset.merging", "dataset"),
     *("models", "models.normaliser", "models.performance", "training"),

@@ -15,7 +15,7 @@ from wlplan.cli.outputs import QUANTITIES, checked_folder, json_text, print_tabl
 from wlplan.cli.progress import Progress, Stopwatch
 from wlplan.errors import InputError
 
-# A data set of so many takes 27 GB.
+# A data set of so many takes 32 GB.
 _MOST_CYCLES = 1_000_000
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wlplan.automaton import relax
-from wlplan.dataset.variables import LOADS, VARIABLES
+from wlplan.dataset.variables import LOADS, VARIABLES, h36_after
 from wlplan.errors import InputError
 from wlplan.pile import SEED_PILES, seed_pile, toe_contour
 from wlplan.sampling import latin_hypercube
@@ -144,7 +144,10 @@ class Rollout:
     def take_in(self, height: Array, record: dict[str, Array]) -> None:
         """The surface after the loading and its simulated variables."""
         self.height = height
+        simulated = {name: np.asarray(value) for name, value in record.items()}
+        maps = (simulated[name] for name in ("h36", "h52", "h52_after"))
         known = {
+            "h36_after": h36_after(*maps),
             "action": self.action[self.load],
             "pose": self.pose,
             "valid": self.valid,
@@ -152,7 +155,7 @@ class Rollout:
             "seed_pile": self.seed_pile,
             "load": self.load,
         }
-        self.played.append(jax.tree.map(np.asarray, record) | known)
+        self.played.append(simulated | known)
 
     def records(self) -> dict[str, np.ndarray]:
         """The variables of all loadings."""

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from wlplan.dataset.protocol import Layout
-from wlplan.dataset.variables import LOADS, VARIABLES, Dataset
+from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, h36_after
 from wlplan.errors import InputError
 from wlplan.simulator import Simulator
 
@@ -135,10 +135,17 @@ def resume(path: Path, wanted: Mapping[str, Any]) -> int:
             f"{path}: was begun with {name} {found!r}, not {value!r}: use the same settings to go "
             f"on with it, or choose another place."
         )
+    done = int(attributes["cycles_done"])
+    lacking = [name for name in VARIABLES if not (path / name / "zarr.json").is_file()]
+    if lacking and done < wanted["cycles"]:
+        raise InputError(
+            f"{path}: has no {lacking[0]}: it was begun by another version of wlplan; finish it "
+            f"with that one, or choose another place."
+        )
     # A process that was killed while it wrote leaves files that were never finished.
     for partial_file in path.glob("**/*.partial"):
         partial_file.unlink(missing_ok=True)
-    return int(attributes["cycles_done"])
+    return done
 
 
 def part_of(attributes: Mapping[str, Any]) -> str:
@@ -296,7 +303,7 @@ def _start_of(pid: int) -> str:
 
 
 def open_dataset(path: str | os.PathLike[str]) -> Dataset:
-    """Reads a complete data set into memory, 27 kB a cycle.
+    """Reads a complete data set into memory, 32 kB a cycle.
 
     Raises:
         InputError: If it is missing, not complete, damaged, of another format, or a shard: who
@@ -321,6 +328,8 @@ def open_dataset(path: str | os.PathLike[str]) -> Dataset:
     try:
         group = zarr.open_group(str(path), mode="r", zarr_format=3)
         for name, variable in VARIABLES.items():
+            if name == "h36_after" and name not in group:
+                continue
             array = group[name]
             if not isinstance(array, zarr.Array) or array.nchunks_initialized < array.nchunks:
                 raise ValueError(f"parts of {name} are missing")
@@ -331,4 +340,7 @@ def open_dataset(path: str | os.PathLike[str]) -> Dataset:
         # Damaged chunks make the decoders raise almost anything; to the user it means the same.
         what = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{path}: is damaged ({what}): copy or collect it again.") from error
+    if "h36_after" not in columns:
+        # Earlier versions did not store it.
+        columns["h36_after"] = h36_after(columns["h36"], columns["h52"], columns["h52_after"])
     return Dataset(**columns, attributes=attributes)

@@ -12,7 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from wlplan.errors import InputError
-from wlplan.heightmap import PERFORMANCE_CELLS, STATE_CELLS, STATE_DISPLACEMENT
+from wlplan.heightmap import (
+    PERFORMANCE_CELLS,
+    PERFORMANCE_DISPLACEMENT,
+    STATE_CELLS,
+    STATE_DISPLACEMENT,
+)
 from wlplan.pile import SEED_PILES
 from wlplan.simulator import STOP_REASONS
 from wlplan.types import Action, Characteristics, Pose
@@ -64,7 +69,14 @@ VARIABLES: dict[str, Variable] = {
         (3,),
         {"components": [field.name for field in dataclasses.fields(Pose)]},
     ),
-    "h36": _map(PERFORMANCE_CELLS, "local heightmap of the performance predictor", 0.0),
+    "h36": _map(
+        PERFORMANCE_CELLS, "local heightmap of the performance predictor", PERFORMANCE_DISPLACEMENT
+    ),
+    "h36_after": _map(
+        PERFORMANCE_CELLS,
+        "h36 after the loading, over the same reference",
+        PERFORMANCE_DISPLACEMENT,
+    ),
     "h52": _map(STATE_CELLS, "local heightmap of the pile state predictor", STATE_DISPLACEMENT),
     "h52_after": _map(
         STATE_CELLS, "h52 after the loading, over the same reference", STATE_DISPLACEMENT
@@ -112,6 +124,7 @@ class Dataset:
     action: Float[np.ndarray, "n 4"]
     pose: Float[np.ndarray, "n 3"]
     h36: Float[np.ndarray, "n 36 36"]
+    h36_after: Float[np.ndarray, "n 36 36"]
     h52: Float[np.ndarray, "n 52 52"]
     h52_after: Float[np.ndarray, "n 52 52"]
     characteristics: Float[np.ndarray, "n 4"]
@@ -174,6 +187,20 @@ def split(
     return tuple(
         dataset.select(np.isin(dataset.rollout, chosen)) for chosen in np.split(order, ends[:-1])
     )
+
+
+def h36_after(
+    h36: Float[np.ndarray, "*n 36 36"],
+    h52: Float[np.ndarray, "*n 52 52"],
+    h52_after: Float[np.ndarray, "*n 52 52"],
+) -> Float[np.ndarray, "*n 36 36"]:
+    """The smaller local map after a loading [m]: its cells are cells of the larger one."""
+    ahead = round((STATE_DISPLACEMENT - PERFORMANCE_DISPLACEMENT) / CELL_SIZE)
+    aside = (STATE_CELLS - PERFORMANCE_CELLS) // 2
+    change = (h52_after - h52)[
+        ..., ahead : ahead + PERFORMANCE_CELLS, aside : aside + PERFORMANCE_CELLS
+    ]
+    return h36 + change
 
 
 def reflect(maps: Float[np.ndarray, "*n i j"]) -> Float[np.ndarray, "*n i j"]:

@@ -384,7 +384,11 @@ def _dig_recorded(
         def step(s: State, _: None) -> tuple[State, None]:
             return _step(s, machine, soil, settings.step), None
 
-        return lax.scan(step, state, None, length=chunk)[0], None
+        def steps(state: State) -> State:
+            return lax.scan(step, state, None, length=chunk)[0]
+
+        # When all have ended there is nothing left to do, nor to go back through.
+        return lax.cond(state.has_ended.all(), lambda s: s, steps, state), None
 
     state = begin(height, ground, action, machine)
     state, _ = lax.scan(advance_chunk, state, None, length=chunk)
@@ -394,28 +398,36 @@ def _dig_recorded(
 def _digger(
     machine: WheelLoader, soil: Soil, settings: Settings
 ) -> Callable[[Array, Array, Action], Cycle]:
-    """Plays cycles side by side; under `vmap` still side by side, the last axis of the arrays."""
+    """Plays cycles side by side."""
 
-    @jax.custom_batching.custom_vmap
     def play(height: Array, ground: Array, action: Action) -> Cycle:
         state = begin(height, ground, action, machine)
         steps = settings.max_steps
         state = advance(state, machine=machine, soil=soil, settings=settings, steps=steps)
         return outcome(state, machine=machine, soil=soil)
 
+    return side_by_side(play)
+
+
+def side_by_side(play: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of cycles side by side that under `vmap` still takes them so.
+
+    Args:
+        play: Function of pytrees of arrays to one, the cycles the last axis of all of them.
+    """
+    play = jax.custom_batching.custom_vmap(play)
+
     @play.def_vmap
-    def play_batch(
-        size: int, batched: Sequence[Any], height: Array, ground: Array, action: Action
-    ) -> tuple[Cycle, Cycle]:
+    def play_batch(size: int, batched: Sequence[Any], *arguments: Any) -> tuple[Any, Any]:
         def join(leaf: Array, is_batched: bool) -> Array:
             leaf = leaf if is_batched else jnp.broadcast_to(leaf, (size, *leaf.shape))
             return jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], -1)
 
-        cycles = play(*jax.tree.map(join, (height, ground, action), tuple(batched)))
+        results = play(*jax.tree.map(join, arguments, tuple(batched)))
 
         def part(leaf: Array) -> Array:
             return jnp.moveaxis(leaf.reshape(*leaf.shape[:-1], size, -1), -2, 0)
 
-        return jax.tree.map(part, cycles), jax.tree.map(lambda _: True, cycles)
+        return jax.tree.map(part, results), jax.tree.map(lambda _: True, results)
 
     return play

@@ -1,0 +1,83 @@
+"""The recorded motion of a loading: that of `dig`, in order, from the approach to the stop."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from wlplan.heightmap import local_axes
+from wlplan.machine import WA320
+from wlplan.simulator import STOP_REASONS, Settings, dig, trace
+from wlplan.types import action_from
+
+ALONG, _ = local_axes(52, 1.0)
+# Actions that end by the tilt, by penetration or breakout, and at the time limit.
+ACTIONS = np.array(
+    [[0.7, 0.0, 0.0, 5.0], [0.1, 1.0, 0.1, 2.5], [0.0, 5.0, 0.7, 0.0], [0.7, 0.0, 0.7, 0.0]],
+    np.float32,
+)
+SLOPE = np.tan(math.radians(30.0))
+HEIGHT = jnp.asarray(np.tile(np.clip(SLOPE * ALONG[:, None], 0.0, 4.0), 52), jnp.float32)
+
+
+def played(function):
+    """A function of surface, floor and action on all the actions."""
+
+    @jax.jit
+    @jax.vmap
+    def play(action):
+        return function(HEIGHT, jnp.zeros_like(HEIGHT), action_from(action))
+
+    return jax.tree.map(np.asarray, play(jnp.asarray(ACTIONS)))
+
+
+@pytest.fixture(scope="module")
+def both():
+    return played(dig), played(trace)
+
+
+def test_it_ends_where_the_cycle_does(both):
+    cycle, trajectory = both
+    assert len(set(cycle.stop_reason.tolist())) > 1
+    assert (trajectory.phase[:, -1] == 2).all()
+    np.testing.assert_allclose(trajectory.mass[:, -1], cycle.mass, rtol=1e-4)
+    np.testing.assert_allclose(trajectory.tilt[:, -1], WA320.tilt_end, atol=1e-3)
+    assert (trajectory.time[:, -1] < cycle.time).all()
+    for k in range(len(ACTIONS)):
+        # The first moment after the filling is that of the stop.
+        stop = int(np.argmax(trajectory.phase[k] >= 1))
+        place = trajectory.tip_x[k, stop], trajectory.tip_z[k, stop]
+        np.testing.assert_allclose(place, (cycle.tip_x[k], cycle.tip_z[k]), atol=1e-4)
+    assert STOP_REASONS[int(cycle.stop_reason[0])] == "tilt_end"
+
+
+def test_it_begins_a_metre_before_the_pile_with_an_empty_bucket_on_the_ground(both):
+    _, trajectory = both
+    np.testing.assert_allclose(trajectory.tip_x[:, 0], -1.0, atol=1e-6)
+    np.testing.assert_allclose(trajectory.tip_z[:, 0], 0.0, atol=1e-6)
+    np.testing.assert_array_equal(trajectory.mass[:, 0], 0.0)
+    np.testing.assert_allclose(trajectory.speed[:, 0], WA320.travel_speed)
+
+
+def test_time_and_position_go_on_step_by_step_and_the_end_repeats(both):
+    _, trajectory = both
+    steps = np.diff(trajectory.time, axis=1)
+    assert (steps >= 0.0).all()
+    assert steps.max() <= Settings().step + 1e-5
+    moving = trajectory.phase[:, 1:] < 2
+    assert (steps[moving] > 0.0).all()
+    assert trajectory.time.shape == (len(ACTIONS), Settings().max_steps + 1)
+    for k in range(len(ACTIONS)):
+        ended = trajectory.phase[k] == 2
+        assert np.ptp(trajectory.tip_x[k][ended]) == 0.0
+        assert (np.diff(trajectory.phase[k]) >= 0).all()
+    assert (np.diff(trajectory.mass, axis=1) > -1.0).all()
+
+
+def test_a_batch_equals_its_members(both):
+    _, trajectory = both
+    alone = jax.jit(trace)(HEIGHT, jnp.zeros_like(HEIGHT), action_from(jnp.asarray(ACTIONS[1])))
+    for one, all_ in zip(jax.tree.leaves(alone), jax.tree.leaves(trajectory), strict=True):
+        np.testing.assert_allclose(one, all_[1], rtol=1e-4, atol=1e-3)
