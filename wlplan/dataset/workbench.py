@@ -1,12 +1,11 @@
-"""Many cycles side by side: rollouts on benches of slots, one bench a thread."""
+"""Many cycles side by side: rollouts on a bench of slots."""
 
 from __future__ import annotations
 
 import functools
 import math
-import queue
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,9 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from wlplan.characteristics import as_vector, characteristics
-from wlplan.compilation import cores
-from wlplan.dataset.protocol import Layout, Rollout, grid_origin, grid_shape, relaxer
-from wlplan.dataset.variables import LOADS, VARIABLES
+from wlplan.dataset.protocol import Rollout
 from wlplan.heightmap import (
     PERFORMANCE_CELLS,
     PERFORMANCE_DISPLACEMENT,
@@ -32,7 +29,7 @@ from wlplan.simulator.cycle import State, advance, begin, outcome
 from wlplan.types import Action, LocalHeightmap, Pile, Pose
 from wlplan.units import CELL_SIZE, J_PER_KJ
 
-# Cycles that one thread computes side by side. Of half as many a time step takes 1.4 times as long
+# Cycles that one process computes side by side. Of half as many a time step takes 1.4 times as long
 # a cycle, of twice as many no less; more leave more idle when the last rollouts are played.
 _SLOTS = 32
 # Time steps after which ended cycles make room for others. A cycle takes about 170 and waits half
@@ -40,83 +37,8 @@ _SLOTS = 32
 _STEPS = 10
 
 
-def batches_of(
-    layout: Layout,
-    start: int,
-    seed: int,
-    simulator: Simulator,
-    progress: Callable[[int, int], None] | None,
-) -> Generator[dict[str, np.ndarray]]:
-    """The variables of one batch of cycles after the other, from cycle `start` of the whole on."""
-    numbers = range(start // LOADS, math.ceil(layout.stop / LOADS))
-    waiting, finished = iter(numbers), queue.SimpleQueue[Any]()
-    lock, stopped = threading.Lock(), threading.Event()
-
-    def take() -> Rollout | None:
-        with lock:
-            number = None if stopped.is_set() else next(waiting, None)
-        return None if number is None else Rollout(number, seed, layout.loads, simulator)
-
-    def work() -> None:
-        try:
-            _Bench(simulator, take, finished.put, stopped).run()
-        except BaseException as error:
-            finished.put(error)
-
-    workers = [
-        threading.Thread(target=work, name="collect", daemon=True)
-        for _ in range(min(cores(), len(numbers)))
-    ]
-    # Alone, so that the programs are compiled once.
-    if numbers:
-        _compile(simulator)
-    for worker in workers:
-        worker.start()
-    try:
-        yield from _in_order(layout, start, finished, progress)
-    finally:
-        stopped.set()
-        for worker in workers:
-            worker.join()
-
-
-def _in_order(
-    layout: Layout,
-    start: int,
-    finished: queue.SimpleQueue[Any],
-    progress: Callable[[int, int], None] | None,
-) -> Iterator[dict[str, np.ndarray]]:
-    """Puts rollouts together to batches as they are finished, in whatever order they are.
-
-    Args:
-        layout: Portions of the collection.
-        start: First cycle, counted in the whole.
-        finished: Loadings that are played as None, rollouts that are finished, and errors.
-        progress: As for `collect`.
-    """
-    rollouts: dict[int, Rollout] = {}
-    played = start
-    while start < layout.stop:
-        stop = min(start + layout.batch_cycles, layout.stop)
-        numbers = range(start // LOADS, math.ceil(stop / LOADS))
-        while not all(number in rollouts for number in numbers):
-            news = finished.get()
-            if isinstance(news, BaseException):
-                raise news
-            if news is None:
-                played += 1
-                if progress is not None:
-                    # Those of the last rollout that are cut off do not count.
-                    progress(min(played, layout.stop) - layout.first, layout.size)
-            else:
-                rollouts[news.number] = news
-        parts = [rollouts.pop(number).records() for number in numbers]
-        yield {n: np.concatenate([p[n] for p in parts])[: stop - start] for n in VARIABLES}
-        start = stop
-
-
-class _Bench:
-    """One thread's rollouts: their cycles are computed side by side, each at its own stage.
+class Bench:
+    """One process's rollouts: their cycles are computed side by side, each at its own stage.
 
     A cycle that has ended makes room for the next of its rollout at once, and a rollout for
     another; so none waits for the slowest. What comes of a rollout does not depend on the others.
@@ -170,7 +92,7 @@ class _Bench:
         height, maps, numbers = self.programs.leave(
             self.states, slot, rollout.origin, rollout.height, rollout.pose, self.views[slot]
         )
-        rollout.take_in(height, {**maps, **_named(np.asarray(numbers))})
+        rollout.take_in(height, jax.tree.map(np.asarray, maps) | _named(np.asarray(numbers)))
         self.put(None)
         if rollout.load == rollout.loads:
             self.put(rollout)
@@ -301,7 +223,7 @@ def _leave(
 _NUMBERS = ("mass", "time", "work", "work_slip", "fill_time", "stop_reason")
 
 
-def _named(numbers: Float[np.ndarray, " k"]) -> dict[str, np.ndarray]:
+def _named(numbers: Float[np.ndarray, " k"]) -> dict[str, Any]:
     """The variables that `_leave` returns as one array: `_NUMBERS`, and the characteristics."""
     count = len(_NUMBERS)
     return dict(zip(_NUMBERS, numbers[:count], strict=True)) | {"characteristics": numbers[count:]}
@@ -324,15 +246,3 @@ def _programs(simulator: Simulator) -> _Programs:
     return _Programs(
         jax.jit(advance_, donate_argnums=0), jax.jit(enter, donate_argnums=0), jax.jit(leave)
     )
-
-
-def _compile(simulator: Simulator) -> None:
-    """Compiles what the threads run."""
-    programs = _programs(simulator)
-    shape, pose = grid_shape(), np.zeros(3, np.float32)
-    flat = jnp.zeros(shape, jnp.float32)
-    relaxer(simulator.soil.repose_angle)(Pile(flat, CELL_SIZE, grid_origin()))
-    action = np.zeros(4, np.float32)
-    states, view = programs.enter(_nothing(simulator), 0, grid_origin(), flat, pose, action)
-    states, _ = programs.advance(states)
-    programs.leave(states, 0, grid_origin(), flat, pose, view)
