@@ -1,5 +1,6 @@
 """Laws of the collection: what is stored, resuming, splits, and what bad stores are told."""
 
+import contextlib
 import dataclasses
 import errno
 import functools
@@ -22,10 +23,13 @@ import pytest
 import zarr
 
 from wlplan import cli
+from wlplan.automaton import Schedule
 from wlplan.dataset import (
     VARIABLES,
     Dataset,
+    batches,
     collect,
+    crew,
     fingerprint,
     merge,
     merging,
@@ -37,13 +41,15 @@ from wlplan.dataset import (
 )
 from wlplan.dataset import store as stored
 from wlplan.dataset.protocol import Layout, Rollout, choose_pose
+from wlplan.dataset.worker import simulator_from
 from wlplan.errors import InputError
 from wlplan.heightmap import sample_local
-from wlplan.machine import GRAVEL
+from wlplan.machine import GRAVEL, WA320
 from wlplan.models.normaliser import Normaliser
 from wlplan.pile import SEED_PILES, seed_pile
 from wlplan.sampling import latin_hypercube
 from wlplan.simulator import STOP_REASONS, Simulator
+from wlplan.simulator.cycle import Settings
 from wlplan.types import Pile, Pose
 from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE
 
@@ -56,10 +62,33 @@ LONGER = 17
 def _short_rollouts():
     """Rollouts of 3 loadings, two a batch: 11 cycles make two batches."""
     with pytest.MonkeyPatch.context() as patch:
-        for part in (protocol, workbench, stored):
+        for part in (protocol, batches, stored):
             patch.setattr(part, "LOADS", 3)
         patch.setattr(protocol, "_BATCH", 2)
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def kept_workers():
+    """All workers of this module; they stay from one collection to the next, so compile once."""
+    kept = []
+
+    @contextlib.contextmanager
+    def hired(count):
+        kept.extend(crew.Worker() for _ in range(count - len(kept)))
+        yield kept[:count]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batches, "hired", hired)
+        yield kept
+    for worker in kept:
+        worker.end()
+
+
+@pytest.fixture
+def worker(kept_workers, store):
+    """A worker that has played before."""
+    return kept_workers[0]
 
 
 @pytest.fixture(scope="module")
@@ -203,7 +232,7 @@ def test_the_volume_that_the_map_loses_is_about_the_load(data):
 def played(rollout):
     """A rollout after all its loadings, alone on its bench."""
     rollouts, finished = iter([rollout]), []
-    bench = workbench._Bench(
+    bench = workbench.Bench(
         Simulator(), lambda: next(rollouts, None), finished.append, threading.Event()
     )
     bench.run()
@@ -211,9 +240,14 @@ def played(rollout):
     return rollout
 
 
-def test_a_rollout_does_not_depend_on_those_beside_it(data):
+def test_a_rollout_does_not_depend_on_those_beside_it(data, worker):
     for number in (0, 2):
-        alone = played(Rollout(number, SEED, 3, Simulator())).records()
+        numbers, finished = iter([number]), []
+        session = crew.Session(Simulator(), SEED, 3, 3)
+        worker.play(session, lambda numbers=numbers: next(numbers, None), finished.append)
+        *loadings, (found, alone) = finished
+        assert loadings == [None] * 3
+        assert found == number
         for name in VARIABLES:
             np.testing.assert_array_equal(alone[name], getattr(data, name)[data.rollout == number])
 
@@ -344,19 +378,59 @@ def test_missing_directories_above_are_made(tmp_path):
 
 @pytest.mark.parametrize("cores", [1, 3])
 def test_the_number_of_cores_does_not_show(store, tmp_path, monkeypatch, cores):
-    monkeypatch.setattr(workbench, "cores", lambda: cores)
+    monkeypatch.setattr(batches, "cores", lambda: cores)
     collect(tmp_path / "data.zarr", cycles=CYCLES, seed=SEED)
     assert contents(tmp_path / "data.zarr") == contents(store)
 
 
-def test_what_goes_wrong_beside_is_not_lost(tmp_path, monkeypatch):
-    def fails(*_):
-        raise RuntimeError("no toe")
+def test_what_goes_wrong_in_a_worker_is_not_lost(worker):
+    session = crew.Session(Simulator(), -1, 3, 3)
+    numbers = iter([0])
+    with pytest.raises(RuntimeError, match="non-negative"):
+        worker.play(session, lambda: next(numbers, None), lambda _: None)
+    # It is as good as before.
+    worker.play(dataclasses.replace(session, seed=0), lambda: None, lambda _: None)
 
-    monkeypatch.setattr(protocol, "choose_pose", fails)
-    with pytest.raises(RuntimeError, match="no toe"):
-        collect(tmp_path / "data.zarr", cycles=CYCLES, seed=SEED)
+
+def test_the_end_of_a_worker_is_said_in_one_line(tmp_path, monkeypatch):
+    workers = []
+
+    @contextlib.contextmanager
+    def hired(count):
+        workers.append(crew.Worker())
+        try:
+            yield workers
+        finally:
+            workers[0].end()
+
+    def kill(layout, start, finished, progress):
+        workers[0].process.kill()
+        raise finished.get()
+
+    monkeypatch.setattr(batches, "cores", lambda: 1)
+    monkeypatch.setattr(batches, "hired", hired)
+    monkeypatch.setattr(batches, "_in_order", kill)
+    refused(lambda: collect(tmp_path / "data.zarr", cycles=CYCLES), "exit code -9", "goes on")
     assert "collect" not in [thread.name for thread in threading.enumerate()]
+
+
+def test_a_worker_ends_with_its_collector():
+    """Whatever way that ends: all it sees is the end of its input."""
+    worker = crew.Worker()
+    worker.process.stdin.close()
+    assert worker.process.wait(timeout=300.0) == 0
+    worker.process.stdout.close()
+
+
+def test_a_worker_has_the_simulator_of_its_collector():
+    other = Simulator(
+        soil=dataclasses.replace(GRAVEL, density=1500.0),
+        machine=dataclasses.replace(WA320, bucket_width=2.6),
+        settings=Settings(step=0.01),
+        schedule=Schedule(sweeps=(3, 4), tolerance=0.02),
+    )
+    message = json.loads(json.dumps(crew.Session(other, 1, 2, 3).message()))
+    assert simulator_from(message["simulator"]) == other
 
 
 def test_a_batch_that_was_half_written_is_written_again(store, copy):
@@ -695,8 +769,8 @@ def test_the_command_line_collects_shards_and_merges_them(shards, longer, tmp_pa
 CHILD = """
 import sys
 from wlplan import cli
-from wlplan.dataset import protocol, store, workbench
-for part in (protocol, workbench, store):
+from wlplan.dataset import batches, protocol, store
+for part in (protocol, batches, store):
     part.LOADS = 3
 protocol._BATCH = 2
 sys.exit(cli.main(["collect", *sys.argv[1:]]))

@@ -6,10 +6,12 @@ line between two cell centres). Outside the grid the border value is repeated.
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from wlplan.compilation import kept
 from wlplan.types import LocalHeightmap, Pile, Pose
@@ -100,6 +102,46 @@ def sample_local(
     return LocalHeightmap(height - first, CELL_SIZE, displacement)
 
 
+def cut_out(pile: Pile, start: tuple[Array, ...] | Array, sizes: tuple[int, ...]) -> Pile:
+    """A part of the grid, its origin left as it was.
+
+    Args:
+        pile: One pile.
+        start: First cell of the part.
+        sizes: Its cells along x and y.
+    """
+
+    def cut(field: Array | None) -> Array | None:
+        return None if field is None else lax.dynamic_slice(field, start, sizes)
+
+    return pile.replace(height=cut(pile.height), ground=cut(pile.ground), valid=cut(pile.valid))
+
+
+def part_around(
+    pile: Pile, x: Float[Array, ""], y: Float[Array, ""], cells: int
+) -> tuple[Pile, tuple[Int[Array, ""], Int[Array, ""]]]:
+    """The square part of a grid around a point of the world, and its first cell.
+
+    It lies inside the grid. A side of the grid with fewer cells is kept whole.
+
+    Args:
+        pile: One pile.
+        x: Middle of the part [m].
+        y: Likewise.
+        cells: Cells a side.
+    """
+    sizes = tuple(min(cells, n) for n in pile.height.shape)
+    middle = ((x - pile.origin[0]) / pile.cell_size, (y - pile.origin[1]) / pile.cell_size)
+    start = tuple(
+        jnp.clip(jnp.round(lax.stop_gradient(position)).astype(jnp.int32) - size // 2, 0, n - size)
+        for position, size, n in zip(middle, sizes, pile.height.shape, strict=True)
+    )
+    part = cut_out(pile, start, sizes)
+    corner = jnp.stack([s.astype(pile.height.dtype) for s in start])
+    origin = jnp.asarray(pile.origin) + pile.cell_size * corner
+    return part.replace(origin=origin), (start[0], start[1])
+
+
 def add_local_change(
     height: Float[Array, "nx ny"],
     window: Pile,
@@ -121,17 +163,23 @@ def add_local_change(
         displacement: How far the local map begins before the dig location [m].
     """
     n = change.shape[0]
-    along, left = to_local(pose, *cell_centres(window))
+    # The map reaches half a diagonal on either side of its middle, wherever it is turned to.
+    middle = to_world(pose, jnp.asarray(0.5 * (n - 1) * CELL_SIZE - displacement), jnp.asarray(0.0))
+    reach = math.sqrt(2.0) * (n + 1) * CELL_SIZE / window.cell_size
+    near, start = part_around(window, *middle, math.ceil(reach) + 2)
+    along, left = to_local(pose, *cell_centres(near))
     # A border of zeros lets the change fade to nothing outside the local map.
     padded = jnp.pad(change, 1)
-    start = (-displacement - CELL_SIZE, -(n + 1) / 2 * CELL_SIZE)
-    frame = Pile(padded, CELL_SIZE, jnp.asarray(start, change.dtype))
+    corner = (-displacement - CELL_SIZE, -(n + 1) / 2 * CELL_SIZE)
+    frame = Pile(padded, CELL_SIZE, jnp.asarray(corner, change.dtype))
     inside = (jnp.abs(left) < (n + 1) / 2 * CELL_SIZE) & (
         jnp.abs(along - (n - 1) / 2 * CELL_SIZE + displacement) < (n + 1) / 2 * CELL_SIZE
     )
     on_grid = jnp.where(inside, sample(padded, frame, along, left), 0.0)
-    floor = jnp.zeros_like(height) if window.ground is None else window.ground
-    available = jnp.maximum(height - floor, 0.0)
+    on_grid = kept(on_grid, change[0, 0])
+    surface = lax.dynamic_slice(height, start, on_grid.shape)
+    floor = jnp.zeros_like(surface) if near.ground is None else near.ground
+    available = jnp.maximum(surface - floor, 0.0)
     area_ratio = (CELL_SIZE / window.cell_size) ** 2
     lost = area_ratio * jnp.maximum(-change, 0.0).sum()
     gained = area_ratio * jnp.maximum(change, 0.0).sum()
@@ -139,7 +187,7 @@ def add_local_change(
     gain = jnp.maximum(on_grid, 0.0)
     total = gain.sum()
     scale = jnp.where(total > 0.0, gained / jnp.where(total > 0.0, total, 1.0), 0.0)
-    return height - loss + scale * gain
+    return lax.dynamic_update_slice(height, surface - loss + scale * gain, start)
 
 
 def take(

@@ -11,7 +11,7 @@ import math
 import contourpy
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 from scipy import ndimage
 
 from wlplan.errors import InputError
@@ -171,19 +171,24 @@ def _gradient_noise(
         angle = random.uniform(0.0, 2.0 * math.pi, (period, period))
         u, v = x / wavelength + shift[0], y / wavelength + shift[1]
         i, j = np.floor(u).astype(int), np.floor(v).astype(int)
-        u, v = (u - i)[:, np.newaxis], (v - j)[np.newaxis, :]
+        u, v = u - i, v - j
+        # The weight of a lattice point is a product of one along each axis. So the points are
+        # summed along y first, for each line of the lattice, then along x.
+        on_x, on_y = np.zeros((period, y.size)), np.zeros((period, y.size))
+        for dj in (0, 1):
+            weight, column = _quintic(1.0 - np.abs(v - dj)), (j + dj) % period
+            on_x += weight * np.cos(angle)[:, column]
+            on_y += weight * (v - dj) * np.sin(angle)[:, column]
         octave_sum = np.zeros_like(total)
         for di in (0, 1):
-            for dj in (0, 1):
-                slope = angle[np.ix_((i + di) % period, (j + dj) % period)]
-                rise = np.cos(slope) * (u - di) + np.sin(slope) * (v - dj)
-                octave_sum += _quintic(1.0 - np.abs(u - di)) * _quintic(1.0 - np.abs(v - dj)) * rise
+            weight, row = _quintic(1.0 - np.abs(u - di))[:, np.newaxis], (i + di) % period
+            octave_sum += weight * (u - di)[:, np.newaxis] * on_x[row] + weight * on_y[row]
         # One octave of unit slopes lies within +-1/sqrt(2).
         total += math.sqrt(2.0) * amplitude / 2**octave * octave_sum
     return total
 
 
-def _quintic(t: Float[np.ndarray, "a b"]) -> Float[np.ndarray, "a b"]:
+def _quintic(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return t * t * t * (t * (6.0 * t - 15.0) + 10.0)
 
 
@@ -321,58 +326,70 @@ def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
         above = above - np.asarray(pile.ground, np.float64)
     # Only the part of the map that holds what is higher, with a border of what is not.
     higher = above > rise
-    part = tuple(_span(np.flatnonzero(higher.any(axis=axis))) for axis in (1, 0))
-    near = above[part]
-    labels, count = ndimage.label(higher[part])
-    if count == 0:
+    part = _bounds(higher)
+    near, higher = above[part], higher[part]
+    if higher.size == 0:
         raise InputError(
             f"Nothing to dig: no cell lies more than {rise:g} m above the ground; check the units "
             f"and the ground of the scan."
         )
-    volumes = np.bincount(labels.ravel(), weights=near.ravel())[1:] * cell**2
-    largest = labels == 1 + int(np.argmax(volumes))
-    # The cells on the rim span the same extent as all, and are far fewer.
-    around = np.pad(largest, 1)
-    rim = largest & ~(around[2:, 1:-1] & around[:-2, 1:-1] & around[1:-1, 2:] & around[1:-1, :-2])
-    extent = _largest_extent(np.argwhere(rim) * cell) + cell
-    if volumes.max() < _SMALLEST_VOLUME or extent < WA320.bucket_width:
-        raise InputError(
-            f"Nothing to dig: the largest pile holds {volumes.max():.2g} m^3 and is {extent:.2g} m "
-            f"long; a bucket needs {_SMALLEST_VOLUME:g} m^3 and {WA320.bucket_width:g} m."
-        )
-    # Other piles are sunk and hollows are filled to just the other side of the level.
-    # What is outside is in one piece, unless there are hollows or the pile runs over the edge.
-    solid = largest if ndimage.label(~largest)[1] == 1 else ndimage.binary_fill_holes(largest)
-    alone = np.where(solid, near, np.minimum(near, rise - 1e-6))
-    alone = np.where(solid & ~largest, np.maximum(alone, rise + 1e-6), alone)
     origin = np.asarray(pile.origin, np.float64)
-    x, y = (origin[k] + cell * np.arange(above.shape[k])[part[k]] for k in (0, 1))
-    lines = contourpy.contour_generator(x, y, alone.T).lines(rise)
-    line = max((np.asarray(line) for line in lines), key=_line_length)
-    closed = bool(np.all(line[0] == line[-1])) and len(line) > 2
+    x, y = (origin[k] + cell * np.arange(part[k].start, part[k].stop) for k in (0, 1))
+    lines = _level_lines(near, x, y, rise)
+    if not _is_one_pile(lines, near, higher, cell):
+        # Most piles are one, and to see that takes less time than to look for the largest.
+        lines = _level_lines(_largest_alone(near, higher, rise, cell), x, y, rise)
+    line = max(lines, key=lambda line: _distances(line)[-1])
+    closed = bool(line[0] == line[-1]) and len(line) > 2
 
-    length = _line_length(line)
+    marks = _distances(line)
+    length = float(marks[-1])
     count = max(round(length / _CONTOUR_SPACING), 8)
-    points = _along(line, np.linspace(0.0, length, count, endpoint=not closed), closed, length)
-    normal = _left_normal(points, line, closed, length)
-    if _mean_rise(above, pile, points, normal, 0.2) < _mean_rise(above, pile, points, normal, -0.2):
+
+    def along(distance: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Points at distances along the line [m]; a closed one wraps round, an open one ends."""
+        inside = distance % length if closed else np.clip(distance, 0.0, length)
+        return np.interp(inside, marks, line)
+
+    at = np.linspace(0.0, length, count, endpoint=not closed)
+    points = along(at)
+    # Chords over one bucket width smooth out ripples.
+    half = 0.5 * min(WA320.bucket_width, 0.5 * length)
+    chord = along(at + half) - along(at - half)
+    normal = 1j * chord / np.maximum(np.abs(chord), 1e-9)
+    if closed:
+        # A closed line has the pile inside: the pile is on the left if it runs round to the left.
+        left = float(np.sum(line[:-1].real * line[1:].imag - line[:-1].imag * line[1:].real)) > 0.0
+    else:
+        sides = (_sample(above, points + d * normal, origin, cell).mean() for d in (0.2, -0.2))
+        left = next(sides) >= next(sides)
+    if not left:
         points, normal = points[::-1], -normal[::-1]
 
-    edge = 0.5 * WA320.bucket_width * np.stack([-normal[:, 1], normal[:, 0]], axis=-1)
-    seen = np.ones(above.shape) if pile.valid is None else np.asarray(pile.valid, np.float64)
+    edge = 0.5j * WA320.bucket_width * normal
     accessible = (
-        _inside(points - edge, pile)
-        & _inside(points + edge, pile)
-        & (_sample(seen, points, pile) > 1.0 - 1e-6)
-        & (_sample(above, points + _AHEAD * normal, pile) > rise)
+        _inside(points - edge, pile.height.shape, origin, cell)
+        & _inside(points + edge, pile.height.shape, origin, cell)
+        & (_sample(above, points + _AHEAD * normal, origin, cell) > rise)
     )
-    heading = np.arctan2(normal[:, 1], normal[:, 0])
-    return ToeContour(points, heading, float(length), closed, accessible)
+    if pile.valid is not None:
+        seen = np.asarray(pile.valid, np.float64)
+        accessible &= _sample(seen, points, origin, cell) > 1.0 - 1e-6
+    pairs = np.stack([points.real, points.imag], axis=-1)
+    return ToeContour(pairs, np.angle(normal), length, closed, accessible)
 
 
-def _span(indices: Int[np.ndarray, " n"]) -> slice:
-    """From just before the first of some ascending indices to just after the last."""
-    return slice(max(indices[0] - 1, 0), indices[-1] + 2) if len(indices) else slice(0, 0)
+def _bounds(flags: Bool[np.ndarray, "nx ny"]) -> tuple[slice, slice]:
+    """The part of a grid that holds all flags set, with a border of one cell inside the grid."""
+
+    def span(indices: Int[np.ndarray, " n"], count: int) -> slice:
+        if not len(indices):
+            return slice(0, 0)
+        return slice(max(int(indices[0]) - 1, 0), min(int(indices[-1]) + 2, count))
+
+    nx, ny = flags.shape
+    i, j = np.flatnonzero(flags.any(axis=1)), np.flatnonzero(flags.any(axis=0))
+    return span(i, nx), span(j, ny)
 
 
 def evenly_spaced(contour: ToeContour, n: int) -> Int[np.ndarray, " n"]:
@@ -390,6 +407,74 @@ def evenly_spaced(contour: ToeContour, n: int) -> Int[np.ndarray, " n"]:
     return candidates[((np.arange(n) + 0.5) * candidates.size / n).astype(int)]
 
 
+# In what follows points of the plane are complex numbers x + iy [m], which numpy handles at once.
+
+
+def _level_lines(
+    height: Float[np.ndarray, "n m"],
+    x: Float[np.ndarray, " n"],
+    y: Float[np.ndarray, " m"],
+    level: float,
+) -> list[Complex[np.ndarray, " _"]]:
+    """The lines on which a surface has a height; closed ones end where they begin."""
+    # contourpy's own function for this looks for masked cells, which takes as long again.
+    across, up = np.meshgrid(x, y)
+    generator = contourpy.SerialContourGenerator(
+        across,
+        up,
+        height.T,
+        np.asarray(False),  # no mask
+        corner_mask=False,
+        line_type=contourpy.LineType.Separate,
+        fill_type=contourpy.FillType.OuterCode,
+        quad_as_tri=False,
+        z_interp=contourpy.ZInterp.Linear,
+    )
+    return [np.ascontiguousarray(line).view(np.complex128)[:, 0] for line in generator.lines(level)]
+
+
+def _is_one_pile(
+    lines: list[Complex[np.ndarray, " _"]],
+    above: Float[np.ndarray, "n m"],
+    higher: Bool[np.ndarray, "n m"],
+    cell: float,
+) -> bool:
+    """Whether level lines are for certain the edge of a single pile that is worth digging."""
+    if len(lines) != 1 or lines[0][0] != lines[0][-1] or higher[0, 0]:
+        return False
+    # Where cells meet at a corner only, the line does not tell whether they are one pile.
+    one, other = higher[:-1] ^ higher[1:], higher[:, :-1] ^ higher[:, 1:]
+    if (one[:, :-1] & one[:, 1:] & other[:-1] & other[1:]).any():
+        return False
+    size = cell * (max(higher.shape) - 2)
+    return size >= WA320.bucket_width and bool(above[higher].sum() * cell**2 >= _SMALLEST_VOLUME)
+
+
+def _largest_alone(
+    above: Float[np.ndarray, "n m"], higher: Bool[np.ndarray, "n m"], rise: float, cell: float
+) -> Float[np.ndarray, "n m"]:
+    """The surface with all piles but the largest sunk, and its hollows filled, to about the level.
+
+    Raises:
+        InputError: If the largest is not worth digging.
+    """
+    labels, _ = ndimage.label(higher)
+    volumes = np.bincount(labels.ravel(), weights=above.ravel())[1:] * cell**2
+    largest = labels == 1 + int(np.argmax(volumes))
+    extent = cell * max(side.stop - side.start - 2 for side in _bounds(largest))
+    if extent < WA320.bucket_width:
+        extent = _largest_extent(np.argwhere(largest) * cell) + cell
+    if volumes.max() < _SMALLEST_VOLUME or extent < WA320.bucket_width:
+        raise InputError(
+            f"Nothing to dig: the largest pile holds {volumes.max():.2g} m^3 and is {extent:.2g} m "
+            f"long; a bucket needs {_SMALLEST_VOLUME:g} m^3 and {WA320.bucket_width:g} m."
+        )
+    # What is outside is in one piece, unless there are hollows or the pile runs over the edge.
+    solid = largest if ndimage.label(~largest)[1] == 1 else ndimage.binary_fill_holes(largest)
+    alone = np.where(solid, above, np.minimum(above, rise - 1e-6))
+    return np.where(solid & ~largest, np.maximum(alone, rise + 1e-6), alone)
+
+
 def _largest_extent(points: Float[np.ndarray, "n 2"]) -> float:
     """Longest side of the bounding boxes of a cloud over all directions, to 2 %."""
     angle = np.linspace(0.0, math.pi, 16, endpoint=False)
@@ -397,43 +482,29 @@ def _largest_extent(points: Float[np.ndarray, "n 2"]) -> float:
     return float(np.max(along.max(axis=0) - along.min(axis=0)))
 
 
-def _line_length(line: Float[np.ndarray, "n 2"]) -> float:
-    return float(np.sum(np.hypot(*np.diff(line, axis=0).T)))
+def _distances(line: Complex[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """How far along a line each of its points lies [m]."""
+    return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(line)))])
 
 
-def _along(
-    line: Float[np.ndarray, "n 2"], distance: Float[np.ndarray, " m"], closed: bool, length: float
-) -> Float[np.ndarray, "m 2"]:
-    """Points at distances along a line [m]; a closed one wraps round, an open one ends."""
-    mark = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-    distance = distance % length if closed else np.clip(distance, 0.0, length)
-    return np.stack([np.interp(distance, mark, line[:, axis]) for axis in (0, 1)], axis=-1)
-
-
-def _left_normal(
-    points: Float[np.ndarray, "n 2"], line: Float[np.ndarray, "m 2"], closed: bool, length: float
-) -> Float[np.ndarray, "n 2"]:
-    """Unit normals to the left of the chords over one bucket width, which smooths out ripples."""
-    at = np.linspace(0.0, length, len(points), endpoint=not closed)
-    half = 0.5 * min(WA320.bucket_width, 0.5 * length)
-    chord = _along(line, at + half, closed, length) - _along(line, at - half, closed, length)
-    size = np.maximum(np.hypot(chord[:, 0], chord[:, 1]), 1e-9)[:, np.newaxis]
-    return np.stack([-chord[:, 1], chord[:, 0]], axis=-1) / size
-
-
-def _inside(points: Float[np.ndarray, "n 2"], pile: Pile) -> Bool[np.ndarray, " n"]:
-    cells = (points - np.asarray(pile.origin, np.float64)) / pile.cell_size
-    return np.all((cells >= -1e-6) & (cells <= np.array(pile.height.shape) - 1 + 1e-6), axis=-1)
+def _inside(
+    points: Complex[np.ndarray, " n"],
+    shape: tuple[int, ...],
+    origin: Float[np.ndarray, "2"],
+    cell: float,
+) -> Bool[np.ndarray, " n"]:
+    cells = (points - complex(*origin)) / cell
+    i, j, last = cells.real, cells.imag, np.array(shape) - 1 + 1e-6
+    return (i >= -1e-6) & (i <= last[0]) & (j >= -1e-6) & (j <= last[1])
 
 
 def _sample(
-    values: Float[np.ndarray, "nx ny"], points: Float[np.ndarray, "n 2"], pile: Pile
+    values: Float[np.ndarray, "nx ny"],
+    points: Complex[np.ndarray, " n"],
+    origin: Float[np.ndarray, "2"],
+    cell: float,
 ) -> Float[np.ndarray, " n"]:
     """Bilinear values at points of the world; outside the map those of its edge."""
-    cells = (points - np.asarray(pile.origin, np.float64)) / pile.cell_size
-    return ndimage.map_coordinates(values, cells.T, order=1, mode="nearest")
-
-
-def _mean_rise(above, pile: Pile, points, normal, distance: float) -> float:
-    """Mean height above the ground a little to one side of a line [m]."""
-    return float(np.mean(_sample(above, points + distance * normal, pile)))
+    cells = (points - complex(*origin)) / cell
+    at = np.stack([cells.real, cells.imag])
+    return ndimage.map_coordinates(values, at, order=1, mode="nearest")

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 
 from wlplan.automaton.rounds import DEFAULT_SCHEDULE, Schedule, Terrain, one_round
 from wlplan.automaton.slopes import movable, rises, steeper_than
-from wlplan.automaton.windows import cut_out, pad_pile, paste
+from wlplan.automaton.windows import pad_pile, paste
+from wlplan.heightmap import cut_out
 from wlplan.machine import GRAVEL
 from wlplan.types import Pile
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from wlplan.heightmap import part_around
 from wlplan.types import Pile, Pose
 
 # Side of the window that is settled after a loading [cells], and how far its centre lies ahead of
@@ -19,29 +20,12 @@ def window_of(pile: Pile, pose: Pose) -> tuple[Pile, tuple[Array, Array]]:
 
     The window lies inside the grid. A grid that is smaller is returned whole.
     """
-    centre = (
-        (pose.x + _WINDOW_AHEAD * jnp.cos(pose.heading) - pile.origin[0]) / pile.cell_size,
-        (pose.y + _WINDOW_AHEAD * jnp.sin(pose.heading) - pile.origin[1]) / pile.cell_size,
+    return part_around(
+        pile,
+        pose.x + _WINDOW_AHEAD * jnp.cos(pose.heading),
+        pose.y + _WINDOW_AHEAD * jnp.sin(pose.heading),
+        WINDOW,
     )
-    sizes = tuple(min(WINDOW, n) for n in pile.height.shape)
-    start = tuple(
-        jnp.clip(jnp.round(lax.stop_gradient(position)).astype(jnp.int32) - size // 2, 0, n - size)
-        for position, size, n in zip(centre, sizes, pile.height.shape, strict=True)
-    )
-
-    window = cut_out(pile, start, sizes)
-    corner = jnp.stack([s.astype(pile.height.dtype) for s in start])
-    origin = jnp.asarray(pile.origin) + pile.cell_size * corner
-    return window.replace(origin=origin), (start[0], start[1])
-
-
-def cut_out(pile: Pile, start: Array | tuple[Array, ...], sizes: tuple[int, ...]) -> Pile:
-    """A part of the grid, its origin left as it was."""
-
-    def cut(field: Array | None) -> Array | None:
-        return None if field is None else lax.dynamic_slice(field, start, sizes)
-
-    return pile.replace(height=cut(pile.height), ground=cut(pile.ground), valid=cut(pile.valid))
 
 
 def paste(height: Array, part: Array, start: Array) -> Array:

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from wlplan.dataset import store
+from wlplan.dataset.batches import batches_of
 from wlplan.dataset.protocol import Layout
-from wlplan.dataset.workbench import batches_of
 from wlplan.errors import InputError
 from wlplan.simulator import Simulator
 

@@ -98,20 +98,37 @@ class Layout:
 
 
 class Rollout:
-    """A pile, what is random about digging it, and the loadings so far."""
+    """A pile, what is random about digging it, and the loadings so far.
 
-    def __init__(self, number: int, seed: int, loads: int, simulator: Simulator):
+    Args:
+        number: Number of the rollout; it tells which seed pile.
+        seed: Seed of piles, poses and actions.
+        loads: Loadings to play.
+        simulator: The simulator.
+        length: Loadings of a whole rollout; None: `LOADS`.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        seed: int,
+        loads: int,
+        simulator: Simulator,
+        *,
+        length: int | None = None,
+    ):
+        length = LOADS if length is None else length
         self.number = number
         repeat, self.seed_pile = divmod(number, len(SEED_PILES))
         key = np.random.SeedSequence(seed, spawn_key=(_ROLLOUT_STREAM, number))
         random = np.random.default_rng(key)
         self.noise_seed = int(random.integers(2**31))
-        self.place, turn = random.random((2, LOADS))  # [0, 1) along the accessible toe
+        self.place, turn = random.random((2, length))  # [0, 1) along the accessible toe
         self.turn = _HEADING_SPREAD * (2.0 * turn - 1.0)
         key = np.random.SeedSequence(seed, spawn_key=(_ACTION_STREAM, repeat))
-        unit = latin_hypercube(len(SEED_PILES) * LOADS, 4, np.random.default_rng(key))
+        unit = latin_hypercube(len(SEED_PILES) * length, 4, np.random.default_rng(key))
         low, high = np.array(ACTION_LOW), np.array(ACTION_HIGH)
-        mine = slice(self.seed_pile * LOADS, (self.seed_pile + 1) * LOADS)
+        mine = slice(self.seed_pile * length, (self.seed_pile + 1) * length)
         self.action = (low + (high - low) * unit[mine]).astype(np.float32)
         self.loads = loads
         self.simulator = simulator
@@ -141,11 +158,10 @@ class Rollout:
         self.pose = self.pose if pose is None else pose
         return self.pose, self.action[self.load]
 
-    def take_in(self, height: Array, record: dict[str, Array]) -> None:
+    def take_in(self, height: Array, record: dict[str, Any]) -> None:
         """The surface after the loading and its simulated variables."""
         self.height = height
-        simulated = {name: np.asarray(value) for name, value in record.items()}
-        maps = (simulated[name] for name in ("h36", "h52", "h52_after"))
+        maps = (record[name] for name in ("h36", "h52", "h52_after"))
         known = {
             "h36_after": h36_after(*maps),
             "action": self.action[self.load],
@@ -155,7 +171,7 @@ class Rollout:
             "seed_pile": self.seed_pile,
             "load": self.load,
         }
-        self.played.append(simulated | known)
+        self.played.append(record | known)
 
     def records(self) -> dict[str, np.ndarray]:
         """The variables of all loadings."""

@@ -1,12 +1,11 @@
-"""Many cycles side by side: rollouts on benches of slots, one bench a thread."""
+"""Many cycles side by side: rollouts on a bench of slots."""
 
 from __future__ import annotations
 
 import functools
 import math
-import queue
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,22 +14,22 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from wlplan.characteristics import as_vector, characteristics
-from wlplan.compilation import cores
-from wlplan.dataset.protocol import Layout, Rollout, grid_origin, grid_shape, relaxer
-from wlplan.dataset.variables import LOADS, VARIABLES
+from wlplan.dataset.protocol import Rollout
 from wlplan.heightmap import (
+    PERFORMANCE_CELLS,
+    PERFORMANCE_DISPLACEMENT,
     STATE_CELLS,
     STATE_DISPLACEMENT,
     local_points,
     sample,
-    sample_local,
+    to_world,
 )
 from wlplan.simulator import Simulator
 from wlplan.simulator.cycle import State, advance, begin, outcome
-from wlplan.types import Action, Pile, Pose
+from wlplan.types import Action, LocalHeightmap, Pile, Pose
 from wlplan.units import CELL_SIZE, J_PER_KJ
 
-# Cycles that one thread computes side by side. Of half as many a time step takes 1.4 times as long
+# Cycles that one process computes side by side. Of half as many a time step takes 1.4 times as long
 # a cycle, of twice as many no less; more leave more idle when the last rollouts are played.
 _SLOTS = 32
 # Time steps after which ended cycles make room for others. A cycle takes about 170 and waits half
@@ -38,83 +37,8 @@ _SLOTS = 32
 _STEPS = 10
 
 
-def batches_of(
-    layout: Layout,
-    start: int,
-    seed: int,
-    simulator: Simulator,
-    progress: Callable[[int, int], None] | None,
-) -> Generator[dict[str, np.ndarray]]:
-    """The variables of one batch of cycles after the other, from cycle `start` of the whole on."""
-    numbers = range(start // LOADS, math.ceil(layout.stop / LOADS))
-    waiting, finished = iter(numbers), queue.SimpleQueue[Any]()
-    lock, stopped = threading.Lock(), threading.Event()
-
-    def take() -> Rollout | None:
-        with lock:
-            number = None if stopped.is_set() else next(waiting, None)
-        return None if number is None else Rollout(number, seed, layout.loads, simulator)
-
-    def work() -> None:
-        try:
-            _Bench(simulator, take, finished.put, stopped).run()
-        except BaseException as error:
-            finished.put(error)
-
-    workers = [
-        threading.Thread(target=work, name="collect", daemon=True)
-        for _ in range(min(cores(), len(numbers)))
-    ]
-    # Alone, so that the programs are compiled once.
-    if numbers:
-        _compile(simulator)
-    for worker in workers:
-        worker.start()
-    try:
-        yield from _in_order(layout, start, finished, progress)
-    finally:
-        stopped.set()
-        for worker in workers:
-            worker.join()
-
-
-def _in_order(
-    layout: Layout,
-    start: int,
-    finished: queue.SimpleQueue[Any],
-    progress: Callable[[int, int], None] | None,
-) -> Iterator[dict[str, np.ndarray]]:
-    """Puts rollouts together to batches as they are finished, in whatever order they are.
-
-    Args:
-        layout: Portions of the collection.
-        start: First cycle, counted in the whole.
-        finished: Loadings that are played as None, rollouts that are finished, and errors.
-        progress: As for `collect`.
-    """
-    rollouts: dict[int, Rollout] = {}
-    played = start
-    while start < layout.stop:
-        stop = min(start + layout.batch_cycles, layout.stop)
-        numbers = range(start // LOADS, math.ceil(stop / LOADS))
-        while not all(number in rollouts for number in numbers):
-            news = finished.get()
-            if isinstance(news, BaseException):
-                raise news
-            if news is None:
-                played += 1
-                if progress is not None:
-                    # Those of the last rollout that are cut off do not count.
-                    progress(min(played, layout.stop) - layout.first, layout.size)
-            else:
-                rollouts[news.number] = news
-        parts = [rollouts.pop(number).records() for number in numbers]
-        yield {n: np.concatenate([p[n] for p in parts])[: stop - start] for n in VARIABLES}
-        start = stop
-
-
-class _Bench:
-    """One thread's rollouts: their cycles are computed side by side, each at its own stage.
+class Bench:
+    """One process's rollouts: their cycles are computed side by side, each at its own stage.
 
     A cycle that has ended makes room for the next of its rollout at once, and a rollout for
     another; so none waits for the slowest. What comes of a rollout does not depend on the others.
@@ -134,7 +58,7 @@ class _Bench:
         stopped: threading.Event,
     ):
         self.programs, self.take, self.put, self.stopped = _programs(simulator), take, put, stopped
-        self.state = _nothing(simulator)
+        self.states = _nothing(simulator)
         self.slots: list[Rollout | None] = [None] * _SLOTS
         self.views: list[Array] = [jnp.zeros(0)] * _SLOTS
 
@@ -143,7 +67,7 @@ class _Bench:
         for slot in range(_SLOTS):
             self._fill(slot)
         while any(self.slots) and not self.stopped.is_set():
-            self.state, ended = self.programs.advance(self.state)
+            self.states, ended = self.programs.advance(self.states)
             for slot, has_ended in enumerate(np.asarray(ended).tolist()):
                 if has_ended and self.slots[slot] is not None:
                     self._empty(slot)
@@ -157,18 +81,18 @@ class _Bench:
                 return
             rollout.heap()
         pose, action = rollout.prepare()
-        self.state, self.views[slot] = self.programs.enter(
-            self.state, slot, rollout.origin, rollout.height, pose, action
+        self.states, self.views[slot] = self.programs.enter(
+            self.states, slot, rollout.origin, rollout.height, pose, action
         )
 
     def _empty(self, slot: int) -> None:
         """Writes a loading back to its pile and goes on."""
         rollout = self.slots[slot]
         assert rollout is not None
-        height, record = self.programs.leave(
-            self.state, slot, rollout.origin, rollout.height, rollout.pose, self.views[slot]
+        height, maps, numbers = self.programs.leave(
+            self.states, slot, rollout.origin, rollout.height, rollout.pose, self.views[slot]
         )
-        rollout.take_in(height, record)
+        rollout.take_in(height, jax.tree.map(np.asarray, maps) | _named(np.asarray(numbers)))
         self.put(None)
         if rollout.load == rollout.loads:
             self.put(rollout)
@@ -176,101 +100,149 @@ class _Bench:
         self._fill(slot)
 
 
+# Cycles side by side, as the programs hand them to each other: the heightfields, and the rows of
+# one array for all the rest. Each array of a call takes as long as some arithmetic.
+_States = tuple[Array, ...]
+
+
+def _packed(state: State) -> _States:
+    leaves = jax.tree.leaves(state)
+    small = [leaf.astype(jnp.float32) for leaf in leaves if leaf.ndim < 3]
+    rows = jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in small])
+    return *(leaf for leaf in leaves if leaf.ndim == 3), rows
+
+
+def _unpacked(simulator: Simulator, states: _States) -> State:
+    *large, rows = states
+    cell = jnp.zeros((STATE_CELLS, STATE_CELLS, rows.shape[-1]), jnp.float32)
+    number = cell[0, 0]
+    begin_one = functools.partial(_begin, simulator)
+    like, tree = jax.tree.flatten(
+        jax.eval_shape(begin_one, cell, Action(number, number, number, number))
+    )
+    leaves, heightfields, row = [], iter(large), 0
+    for leaf in like:
+        if leaf.ndim == 3:
+            leaves.append(next(heightfields))
+            continue
+        count = math.prod(leaf.shape[:-1])
+        leaves.append(rows[row : row + count].reshape(leaf.shape).astype(leaf.dtype))
+        row += count
+    return jax.tree.unflatten(tree, leaves)
+
+
 def _begin(simulator: Simulator, height: Array, action: Action) -> State:
     """Cycles about to begin, leaves with the cycles as their last axis."""
     return begin(height, jnp.zeros_like(height), action, simulator.machine)
 
 
-def _nothing(simulator: Simulator) -> State:
+def _nothing(simulator: Simulator) -> _States:
     """A full set of slots in which nothing goes on."""
     zero = jnp.zeros(_SLOTS, jnp.float32)
     height = jnp.zeros((STATE_CELLS, STATE_CELLS, _SLOTS), jnp.float32)
-    return _begin(simulator, height, Action(zero, zero, zero, zero)).ended()
+    states = _packed(_begin(simulator, height, Action(zero, zero, zero, zero)).ended())
+    # Each an array of its own, for they are given away.
+    return tuple(jnp.array(part, copy=True) for part in states)
 
 
-def _advance(simulator: Simulator, state: State) -> tuple[State, Bool[Array, " b"]]:
+def _advance(simulator: Simulator, states: _States) -> tuple[_States, Bool[Array, " b"]]:
     """Some time steps further, and which cycles have ended."""
     state = advance(
-        state,
+        _unpacked(simulator, states),
         machine=simulator.machine,
         soil=simulator.soil,
         settings=simulator.settings,
         steps=_STEPS,
     )
-    return state, state.has_ended
+    return _packed(state), state.has_ended
 
 
 def _enter(
     simulator: Simulator,
-    state: State,
+    states: _States,
     slot: Int[Array, ""] | int,
     origin: Float[Array, "2"],
     height: Float[Array, "nx ny"],
     pose: Float[Array, "3"] | np.ndarray,
     action: Float[Array, "4"] | np.ndarray,
-) -> tuple[State, Float[Array, "52 52"]]:
+) -> tuple[_States, Float[Array, "52 52"]]:
     """The slots with a new loading in one of them, and its surface in the local frame."""
     view, _ = simulator.view(Pile(height, CELL_SIZE, origin), Pose(*pose))
-    one = _begin(simulator, view[..., None], Action(*(part[None] for part in action)))
-    return jax.tree.map(lambda all_, new: all_.at[..., slot].set(new[..., 0]), state, one), view
+    one = _packed(_begin(simulator, view[..., None], Action(*(part[None] for part in action))))
+    entered = (all_.at[..., slot].set(new[..., 0]) for all_, new in zip(states, one, strict=True))
+    return tuple(entered), view
 
 
 def _leave(
     simulator: Simulator,
-    state: State,
+    states: _States,
     slot: Int[Array, ""] | int,
     origin: Float[Array, "2"],
     height: Float[Array, "nx ny"],
     pose: Float[Array, "3"] | np.ndarray,
     view: Float[Array, "52 52"],
-) -> tuple[Float[Array, "nx ny"], dict[str, Array]]:
-    """The surface after the loading of one slot, and the simulated variables."""
-    one = jax.tree.map(lambda all_: all_[..., slot][..., None], state)
+) -> tuple[Float[Array, "nx ny"], dict[str, Array], Float[Array, " k"]]:
+    """The surface after the loading of one slot, the local maps, and the numbers of `_named`."""
+    one = _unpacked(simulator, tuple(part[..., slot][..., None] for part in states))
     cycles = outcome(one, machine=simulator.machine, soil=simulator.soil)
     cycle = jax.tree.map(lambda part: part[..., 0], cycles)
     pile, dig_pose = Pile(height, CELL_SIZE, origin), Pose(*pose)
     after, performance = simulator.leave(pile, dig_pose, view, cycle)
-    h36 = sample_local(pile, dig_pose)
-    h52 = sample_local(pile, dig_pose, cells=STATE_CELLS, displacement=STATE_DISPLACEMENT).height
+
+    def reference(displacement: float) -> Array:
+        point = to_world(dig_pose, jnp.asarray(-displacement), jnp.asarray(0.0))
+        return sample(height, pile, *point)
+
+    # The smaller map is a part of the larger, over a reference of its own.
+    row = round((STATE_DISPLACEMENT - PERFORMANCE_DISPLACEMENT) / CELL_SIZE)
+    column = (STATE_CELLS - PERFORMANCE_CELLS) // 2
+    part = view[row : row + PERFORMANCE_CELLS, column : column + PERFORMANCE_CELLS]
+    h36 = LocalHeightmap(
+        part - reference(PERFORMANCE_DISPLACEMENT), CELL_SIZE, PERFORMANCE_DISPLACEMENT
+    )
+    h52 = view - reference(STATE_DISPLACEMENT)
     points = local_points(dig_pose, STATE_CELLS, STATE_DISPLACEMENT, height.dtype)
-    record = {
-        "mass": performance.mass,
-        "time": performance.time,
-        "work": performance.work,
+    maps = {
         "h36": h36.height,
         "h52": h52,
         # Sampling is linear, so the change can be sampled: where nothing moved it is zero.
         "h52_after": h52 + sample(after.height - height, pile, *points),
-        "characteristics": as_vector(characteristics(h36)),
+    }
+    numbers = {
+        "mass": performance.mass,
+        "time": performance.time,
+        "work": performance.work,
         "work_slip": cycle.work_slip / J_PER_KJ,
         "fill_time": cycle.fill_time,
-        "stop_reason": cycle.stop_reason,
+        "stop_reason": cycle.stop_reason.astype(jnp.float32),
     }
-    return after.height, record
+    in_order = jnp.stack([numbers[name] for name in _NUMBERS])
+    return after.height, maps, jnp.concatenate([in_order, as_vector(characteristics(h36))])
+
+
+_NUMBERS = ("mass", "time", "work", "work_slip", "fill_time", "stop_reason")
+
+
+def _named(numbers: Float[np.ndarray, " k"]) -> dict[str, Any]:
+    """The variables that `_leave` returns as one array: `_NUMBERS`, and the characteristics."""
+    count = len(_NUMBERS)
+    return dict(zip(_NUMBERS, numbers[:count], strict=True)) | {"characteristics": numbers[count:]}
 
 
 class _Programs(NamedTuple):
     """`_advance`, `_enter` and `_leave` of one simulator, compiled."""
 
-    advance: Callable[..., tuple[State, Bool[Array, " b"]]]
-    enter: Callable[..., tuple[State, Float[Array, "52 52"]]]
-    leave: Callable[..., tuple[Float[Array, "nx ny"], dict[str, Array]]]
+    advance: Callable[..., tuple[_States, Bool[Array, " b"]]]
+    enter: Callable[..., tuple[_States, Float[Array, "52 52"]]]
+    leave: Callable[..., tuple[Float[Array, "nx ny"], dict[str, Array], Float[Array, " k"]]]
 
 
 @functools.cache
 def _programs(simulator: Simulator) -> _Programs:
     # Bound to their simulator, for JAX takes 0.2 ms a call to look at it.
     bound = (functools.partial(function, simulator) for function in (_advance, _enter, _leave))
-    return _Programs(*map(jax.jit, bound))
-
-
-def _compile(simulator: Simulator) -> None:
-    """Compiles what the threads run."""
-    programs = _programs(simulator)
-    shape, pose = grid_shape(), np.zeros(3, np.float32)
-    flat = jnp.zeros(shape, jnp.float32)
-    relaxer(simulator.soil.repose_angle)(Pile(flat, CELL_SIZE, grid_origin()))
-    action = np.zeros(4, np.float32)
-    state, view = programs.enter(_nothing(simulator), 0, grid_origin(), flat, pose, action)
-    state, _ = programs.advance(state)
-    programs.leave(state, 0, grid_origin(), flat, pose, view)
+    advance_, enter, leave = bound
+    # The slots are changed where they are.
+    return _Programs(
+        jax.jit(advance_, donate_argnums=0), jax.jit(enter, donate_argnums=0), jax.jit(leave)
+    )
