@@ -294,8 +294,13 @@ def move(
     )
     laid = _hat(along[1:-1] - (x + _PUSH_LENGTH / 2), _PUSH_LENGTH / 2)
     laid = jnp.pad(laid, ((1, 1), (0, 0)), mode="edge")
-    bucket, open_part, passed, inside, laid = stored(
-        (bucket, open_part, passed, inside, laid), wanted
+    # What stands higher than the side plates falls off to the ground beside them. A whole sweep
+    # of the automaton stands for _SLIDE_TIME, a shorter step for its share of one.
+    share = step / _SLIDE_TIME
+    over = share * _over_the_sides(fill, lanes.width, machine)
+    along_sides = inside / jnp.maximum(total(inside[1:-1]), 1e-6)[None]
+    bucket, open_part, passed, inside, laid, along_sides, over = stored(
+        (bucket, open_part, passed, inside, laid, along_sides, over), wanted
     )
     cut = (
         passed[:, None]
@@ -305,8 +310,13 @@ def move(
     swept = total(lanes.of(cut)) * _CELL_AREA
     pushed = (1.0 - open_part) * swept
     swept, pushed = stored((swept, pushed), wanted)
-    aside = jnp.asarray(_aside(lanes), dtype)
-    height = height - cut + laid[:, None] * (aside @ (pushed / _CELL_AREA))[None]
+    aside = jnp.asarray(_aside(lanes), dtype) @ (pushed / _CELL_AREA)
+    height = (
+        height
+        - cut
+        + laid[:, None] * aside[None]
+        + along_sides[:, None] * lanes.beside(over / _CELL_AREA)
+    )
     fill = fill + swept - pushed
 
     # Soil slides. Cells inside the bucket stand at the level of its mouth: empty, that is the
@@ -330,8 +340,6 @@ def move(
         surface,
         giving,
     )
-    # A whole sweep stands for _SLIDE_TIME, a shorter step for its share of one.
-    share = step / _SLIDE_TIME
     change = -share * FLOW_FRACTION * outflow
     gain = jnp.maximum(change, 0.0)
     into_bucket = total(inside[1:-1, None] * gain[:, lanes.first : lanes.end])
@@ -339,13 +347,9 @@ def move(
     taken = _shifted(occupied, 0, 0) * lanes.spread(open_part)[None, 1:-1] * gain
     slid = _with_rim(_shifted(height, 0, 0) + change - taken)
 
-    # Inside the bucket the lanes level out at the angle of repose, like the terrain, and what
-    # stands higher than the side plates falls off to the ground beside them.
-    over = share * _over_the_sides(fill, lanes.width, machine)
+    # Inside the bucket the lanes level out at the angle of repose, like the terrain.
     fill = fill - share * _lane_outflow(fill, lanes.width, machine, soil)
-    fill = fill.at[0].add(-over[0]).at[-1].add(-over[1])
-    along_sides = inside / jnp.maximum(total(inside[1:-1]), 1e-6)[None]
-    return slid + along_sides[:, None] * lanes.beside(over / _CELL_AREA), fill
+    return slid, fill.at[0].add(-over[0]).at[-1].add(-over[1])
 
 
 def _aside(lanes: Lanes) -> np.ndarray:
