@@ -104,8 +104,9 @@ class Linkage:
 
     def tip(self, position: float, boom: float, tilt: float) -> tuple[float, float]:
         """Position of the cutting edge [m]."""
-        x, _, z = self.points(position, boom, tilt, np.zeros((1, 3)))[0]
-        return float(x), float(z)
+        x, z = self.pin(position, boom)
+        c, s = math.cos(tilt), math.sin(tilt)
+        return x + c * self.forward + s * self.down, z + s * self.forward - c * self.down
 
     def in_bucket(
         self, position: float, boom: float, tilt: float, points: np.ndarray

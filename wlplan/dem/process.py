@@ -18,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,9 +45,6 @@ _WORKER = (
 )
 # Surfaces are rounded to this [m], so that rounding errors do not make another job of the same.
 _ROUNDED = 1e-4
-
-Tell = Callable[[str], None]
-"""What a line for the user is given to."""
 
 
 def cache_folder() -> Path:
@@ -80,7 +77,6 @@ def play(
     soil: Soil,
     settings: Settings,
     walls: Walls = Walls(),  # noqa: B008 (frozen)
-    tell: Tell | None = None,
 ) -> Played:
     """Plays one cycle in the engine, or reads it if it was played before.
 
@@ -91,7 +87,6 @@ def play(
         soil: What is dug.
         settings: Of the engine.
         walls: Where the domain ends.
-        tell: Told before the bed is made, which takes a minute or two; default: nothing.
 
     Raises:
         InputError: If the engine is missing, was killed, or takes too long.
@@ -111,7 +106,7 @@ def play(
     target = cache_folder() / f"cycle-{_digest(identity, rounded, numbers)}.npz"
     arrays = _stored(target, _fields(Played))
     if arrays is None:
-        job = {**identity, "soil": dataclasses.asdict(soil), "bed": str(bed_file(settings, tell))}
+        job = {**identity, "soil": dataclasses.asdict(soil), "bed": str(bed_file(settings))}
         arrays = run_job(
             job, {"surface": rounded * _ROUNDED, "action": numbers}, timeout=settings.timeout
         )
@@ -119,12 +114,11 @@ def play(
     return Played(**{name: _plain(arrays[name]) for name in _fields(Played)})
 
 
-def bed_file(settings: Settings, tell: Tell | None = None) -> Path:
-    """The file of the bed that piles are cut from, made if it is missing.
+def bed_file(settings: Settings) -> Path:
+    """The file of the bed that piles are cut from, made if it is missing, which stderr is told.
 
     Args:
         settings: Of the engine; only the grains matter.
-        tell: Told if it has to be made; default: nothing.
 
     Raises:
         InputError: As of `play`.
@@ -133,8 +127,7 @@ def bed_file(settings: Settings, tell: Tell | None = None) -> Path:
     target = cache_folder() / f"bed-{_digest({'version': VERSION, 'grains': grains})}.npz"
     names = ("centre", "radius", "lengths", "packing")
     if _stored(target, names) is None:
-        if tell is not None:
-            tell("settling a bed of spheres, once: a minute or two")
+        sys.stderr.write("note: settling a bed of spheres, once: about two minutes\n")
         made = run_job(
             {"kind": "bed", "settings": dataclasses.asdict(settings)}, {}, timeout=settings.timeout
         )
@@ -195,8 +188,7 @@ def run_job(
         if done.returncode != 0:
             raise InputError(_complaint(done.returncode, done.stderr.decode(errors="replace")))
         try:
-            with np.load(target, allow_pickle=False) as stored:
-                return {name: stored[name] for name in stored}
+            return _read(target)
         except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(
                 f"the discrete-element engine left no readable result ({one_line(error)}): check "
@@ -232,10 +224,16 @@ def _fields(kind: Any) -> tuple[str, ...]:
 def _stored(path: Path, names: Sequence[str]) -> dict[str, np.ndarray] | None:
     """A result that was kept; None if there is none, or it cannot be used."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in names}
+        stored = _read(path)
+        return {name: stored[name] for name in names}
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
         return None
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    # From memory: NumPy leaves a file open that turns out not to be whole.
+    with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored}
 
 
 def _keep(path: Path, arrays: dict[str, np.ndarray], names: Sequence[str]) -> None:

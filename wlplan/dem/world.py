@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, no_type_check
 
 import jax
@@ -61,18 +61,15 @@ class DiscreteElements(struct.PyTreeNode):
 
         The engine's floor is level: where the pile's is not, the soil is laid down on a level one.
         """
-        points = local_points(pose, columns.CELLS, columns.DISPLACEMENT, pile.height.dtype)
-        height = pile.height if pile.ground is None else pile.height - pile.ground
-        return jnp.maximum(sample(height, pile, *points), 0.0)
+        return _view(pile, pose)
 
-    def play(self, surface: np.ndarray, action: np.ndarray, tell: process.Tell) -> Played:
+    def play(self, surface: np.ndarray, action: np.ndarray, tell: Callable[[str], None]) -> Played:
         """Plays one loading in the engine.
 
         Args:
             surface: As of `view`.
             action: delta_bm, k_bm, delta_bk, k_bk.
-            tell: Told what is worth knowing: of a bed to be made, and of soil that the engine does
-                not see.
+            tell: Told of soil that the engine does not see.
 
         Raises:
             InputError: If the engine is missing or fails.
@@ -89,7 +86,6 @@ class DiscreteElements(struct.PyTreeNode):
             machine=self.machine,
             soil=self.soil,
             settings=self.settings,
-            tell=tell,
         )
         if played.cleared > _CLEARED:
             tell(
@@ -116,16 +112,24 @@ class DiscreteElements(struct.PyTreeNode):
         Returns:
             The pile after, relaxed, and the performance.
         """
-        window, start = window_of(pile, pose)
-        dug = add_local_change(window.height, window, pose, change, columns.DISPLACEMENT)
-        after = settle_dug(
-            pile,
-            dug,
-            start,
-            repose_angle=self.soil.repose_angle,
-            schedule=self.schedule,
-        )
+        after = _leave(pile, pose, change, self.soil.repose_angle, self.schedule)
         return after, Performance(*(numbers[k] for k in range(3)))
+
+
+@jax.jit
+def _view(pile: Pile, pose: Pose) -> Float[Array, "n n"]:
+    points = local_points(pose, columns.CELLS, columns.DISPLACEMENT, pile.height.dtype)
+    height = pile.height if pile.ground is None else pile.height - pile.ground
+    return jnp.maximum(sample(height, pile, *points), 0.0)
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def _leave(
+    pile: Pile, pose: Pose, change: Float[Array, "n n"], repose_angle: float, schedule: Schedule
+) -> Pile:
+    window, start = window_of(pile, pose)
+    dug = add_local_change(window.height, window, pose, change, columns.DISPLACEMENT)
+    return settle_dug(pile, dug, start, repose_angle=repose_angle, schedule=schedule)
 
 
 def outcome_of(played: Played, world: DiscreteElements) -> tuple[np.ndarray, np.ndarray]:
@@ -136,7 +140,7 @@ def outcome_of(played: Played, world: DiscreteElements) -> tuple[np.ndarray, np.
 
 
 def loads(
-    world: DiscreteElements, pile: Pile, plan: LoadingPlan, tell: process.Tell
+    world: DiscreteElements, pile: Pile, plan: LoadingPlan, tell: Callable[[str], None]
 ) -> Iterator[tuple[Pile, Performance, Played]]:
     """Plays a plan load by load, outside of any trace.
 
@@ -154,14 +158,14 @@ def loads(
     Raises:
         InputError: As of `DiscreteElements.play`.
     """
-    view, leave = jax.jit(world.view), jax.jit(world.leave)
     for n in range(len(plan.pose.x)):
         pose, action = jax.tree.map(lambda leaf, n=n: leaf[n], (plan.pose, plan.action))
-        played = world.play(*_arrays(view(pile, pose), action_vector(action)), tell)
-        change, numbers = (
+        surface, numbers = world.view(pile, pose), action_vector(action)
+        played = world.play(np.asarray(surface), np.asarray(numbers), tell)
+        change, outcome = (
             jnp.asarray(part, pile.height.dtype) for part in outcome_of(played, world)
         )
-        pile, performance = leave(pile, pose, change, numbers)
+        pile, performance = world.leave(pile, pose, change, outcome)
         yield pile, performance, played
 
 
@@ -184,14 +188,14 @@ def site_remark(soil: Soil) -> str | None:
 def _without_derivative(world: DiscreteElements, surface: Array, numbers: Array) -> Any:
     dtype = surface.dtype
 
-    def call(surface: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        played = world.play(surface, numbers, _warn)
+    def call(surface: Array, numbers: Array) -> tuple[np.ndarray, np.ndarray]:
+        played = world.play(np.asarray(surface), np.asarray(numbers), _warn)
         change, outcome = outcome_of(played, world)
         return change.astype(dtype), outcome.astype(dtype)
 
     if not any(isinstance(part, jax.core.Tracer) for part in (surface, numbers)):
         # Without a trace, errors arrive as they are.
-        return tuple(jnp.asarray(part) for part in call(*_arrays(surface, numbers)))
+        return tuple(jnp.asarray(part) for part in call(surface, numbers))
     shapes = (
         jax.ShapeDtypeStruct((columns.CELLS, columns.CELLS), dtype),
         jax.ShapeDtypeStruct((3,), dtype),
@@ -205,10 +209,6 @@ def _no_jvp(world: DiscreteElements, primals: Any, tangents: Any) -> Any:
         "the discrete elements have no derivative: plan in a model, or use a planner without "
         "gradients"
     )
-
-
-def _arrays(surface: Array, numbers: Array) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(surface), np.asarray(numbers)
 
 
 def _warn(message: str) -> None:
