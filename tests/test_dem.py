@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments import dem_cycles
 from wlplan import cli, io
 from wlplan.dem import bucket, columns, cycle, grains, loader, packing, process, worker
 from wlplan.dem.world import DiscreteElements, loads, site_remark
@@ -579,6 +580,59 @@ def test_an_interrupted_plan_goes_on(jobs, files, monkeypatch, capsys):
     monkeypatch.setattr(process, "run_job", real)
     assert cli.main(["simulate", *files, "--engine", "dem"]) == 0
     assert [job["kind"] for job, _ in jobs] == ["bed", "cycle", "cycle"]
+
+
+# --- the recipe of reference cycles
+
+
+def test_cycles_are_collected_and_gone_on_with(monkeypatch, tmp_path, capsys):
+    asked = []
+
+    def play(surface, action, *, machine, soil, settings):
+        asked.append((surface, action, settings.packing))
+        return played(mass=1000.0 * len(asked), record=np.ones((5, len(loader.RECORDED))))
+
+    monkeypatch.setattr(process, "play", play)
+    path = tmp_path / "cycles.npz"
+    words = ["--out", str(path), "--seed", "3", "--cycles"]
+    assert dem_cycles.main([*words, "3"]) == 0
+    assert dem_cycles.main([*words, "5"]) == 0
+    assert len(asked) == 5
+    with np.load(path, allow_pickle=False) as stored:
+        cycles = {name: stored[name] for name in stored}
+    assert cycles["mass_t"].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert cycles["pile_id"].tolist() == ["3-0", "3-0", "3-1", "3-1", "3-2"]
+    assert cycles["cycle_in_pile"].tolist() == [0, 1, 0, 1, 0]
+    assert cycles["shape"].tolist() == ["plane", "plane", "cone", "cone", "wedge"]
+    assert cycles["traj"].shape == (5, 5, len(loader.RECORDED))
+    assert np.allclose(cycles["h0_cg"] * cycles["unit_m"], 1.0, atol=1e-3)
+    # Played in one go, they are the same.
+    again = list(asked)
+    asked.clear()
+    assert dem_cycles.main(["--out", str(tmp_path / "other.npz"), *words[2:], "5"]) == 0
+    for (surface, action, packing_), (other, same, number) in zip(again, asked, strict=True):
+        assert np.allclose(surface, other, atol=1e-6)
+        assert np.array_equal(action, same)
+        assert packing_ == number
+    assert dem_cycles.main([*words, "6", "--repeats", "2"]) == 2
+    assert "another seed" in capsys.readouterr().err
+
+
+def test_repeats_change_the_packing_and_nothing_else():
+    rows = [dem_cycles.next_cycle(1, n, 3, []) for n in range(4)]
+    for surface, action, _, _ in rows[1:3]:
+        assert np.array_equal(surface, rows[0][0])
+        assert np.array_equal(action, rows[0][1])
+    assert [packing_ for _, _, packing_, _ in rows] == [0, 1, 2, 0]
+    assert not np.array_equal(rows[3][1], rows[0][1])
+
+
+def test_the_second_loading_begins_at_the_new_toe():
+    x, _ = columns.axes()
+    pile = np.repeat(np.clip(0.5 * (x - 0.8), 0.0, 2.0)[:, None], columns.CELLS, axis=1)
+    moved = dem_cycles.at_new_toe(pile, 2.7)
+    # As high as a toe at 1.1 m: the new dig location is 0.15 m before it.
+    assert np.interp(0.15, x, moved[:, 40]) == pytest.approx(0.15, abs=0.03)
 
 
 # --- the engine itself

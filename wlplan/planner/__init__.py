@@ -163,12 +163,15 @@ def judge(
         objective: Name or weights.
         receiver: Where the loads go; default: the follow-up's place relative to the pile.
     """
-    return judged(
+    return _judged(
         default_receiver(pile) if receiver is None else receiver,
         objective_named(objective),
         plan,
         outcome,
     )
+
+
+_judged = jax.jit(judged, static_argnums=1)
 
 
 def _has_no_gradient(world: World) -> bool:
