@@ -251,6 +251,29 @@ def test_the_lane_is_as_wide_as_the_bucket():
     assert packing.in_lane(centre, 2.7).tolist() == [True, False, False]
 
 
+def test_the_space_is_large_enough_for_any_bucket():
+    large = dataclasses.replace(
+        WA320,
+        bucket_depth=3.0,
+        bucket_heaped=20.0,
+        bucket_width=5.0,
+        pivot_height=4.0,
+        boom_length=6.0,
+        tip_radius=3.0,
+    )
+    for machine in (WA320, large):
+        plates = bucket.plate_spheres(machine)
+        (behind, _), (right, left), (_, above) = cycle._space(machine, plates, packing.Walls())
+        linkage = loader.Linkage(machine)
+        for position in (loader.START, loader.FREE):
+            for boom in (machine.boom_low, machine.boom_carry, machine.boom_high):
+                for tilt in (0.0, machine.tilt_end):
+                    place = linkage.points(position, boom, tilt, plates)
+                    assert behind < place[:, 0].min()
+                    assert right < place[:, 1].min() < place[:, 1].max() < left
+                    assert place[:, 2].max() < above
+
+
 # --- what a cycle changes
 
 

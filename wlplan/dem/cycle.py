@@ -11,7 +11,7 @@ from wlplan.dem import columns
 from wlplan.dem.bucket import PLATE_RADIUS, plate_spheres, section_of
 from wlplan.dem.engine import Engine, open_box
 from wlplan.dem.grains import Settings
-from wlplan.dem.loader import RECORDED, Loader, Reaction
+from wlplan.dem.loader import FREE, RECORDED, Loader, Reaction
 from wlplan.dem.packing import Bed, Walls, cut, in_lane
 from wlplan.machine import Soil, WheelLoader
 from wlplan.units import CELL_SIZE
@@ -79,7 +79,9 @@ def play_cycle(
     """
     density = soil.density / bed.packing
     step = settings.time_step(soil.density)
-    rest = _Rest(settings, walls, density, step)
+    plates = plate_spheres(machine)
+    box = _space(machine, plates, walls)
+    rest = _Rest(settings, walls, box, density, step)
     centre, radius = rest(*cut(bed, surface, walls, settings.packing), *_AFTER_CUT)
     blocked = in_lane(centre, machine.bucket_width)
     bulk = 4.0 / 3.0 * math.pi / bed.packing
@@ -93,7 +95,6 @@ def play_cycle(
     x, _ = columns.axes()
     profile = columns.centre_line(seen_before)
     loader = Loader(machine, action, lambda at: float(np.interp(at, x, profile)), steps * step)
-    plates = plate_spheres(machine)
     start = loader.linkage.points(loader.position, loader.boom, loader.tilt, plates)
     with Engine(
         np.concatenate([centre, start]),
@@ -101,7 +102,7 @@ def play_cycle(
         plates=len(plates),
         density=density,
         grains=settings.grains,
-        box=open_box(walls),
+        box=box,
         step=step,
         bucket_friction=math.tan(soil.steel_friction),
     ) as engine:
@@ -134,6 +135,13 @@ def play_cycle(
         envelope_after=columns.envelope(left, left_radius),
         record=record,
     )
+
+
+def _space(machine: WheelLoader, plates: np.ndarray, walls: Walls) -> np.ndarray:
+    """Space in which the bucket stays, wherever it is turned to, with a metre around it [m]."""
+    reach = float(np.hypot(plates[:, 0], plates[:, 2]).max()) + machine.tip_radius
+    top = machine.pivot_height + machine.boom_length + reach
+    return open_box(walls, FREE - reach - 1.0, top + 1.0)
 
 
 def _dig(engine: Engine, loader: Loader, plates: np.ndarray) -> np.ndarray:
@@ -179,12 +187,16 @@ class _Rest:
     Args:
         settings: Of the engine.
         walls: Where the domain ends.
+        box: Space that the spheres may fly in [m], shape [3, 2].
         density: Of the spheres themselves [kg/m^3].
         step: Time step [s].
     """
 
-    def __init__(self, settings: Settings, walls: Walls, density: float, step: float):
-        self._settings, self._walls, self._density, self._step = settings, walls, density, step
+    def __init__(
+        self, settings: Settings, walls: Walls, box: np.ndarray, density: float, step: float
+    ):
+        self._settings, self._walls, self._box = settings, walls, box
+        self._density, self._step = density, step
 
     def __call__(
         self, centre: np.ndarray, radius: np.ndarray, dragged: float, free: float
@@ -204,7 +216,7 @@ class _Rest:
             radius,
             density=self._density,
             grains=self._settings.grains,
-            box=open_box(self._walls),
+            box=self._box,
             step=self._step,
         ) as engine:
             engine.wall_in(self._walls)

@@ -22,8 +22,8 @@ MISSING = "the discrete-element engine is not installed: pip install 'wlplan[dem
 
 # Sorts of spheres, as LAMMPS numbers them.
 SOIL, BUCKET = 1, 2
-# Space that the spheres may fly in: behind, beside and beyond the walls, and up [m].
-_BEHIND, _MARGIN, _BELOW, _ABOVE = -4.5, 0.3, -0.3, 6.0
+# Space beside and beyond the walls, and below the floor [m].
+_MARGIN, _BELOW = 0.3, -0.3
 
 
 def _library() -> Any:
@@ -195,13 +195,19 @@ class Engine:
         return np.array([fx, fz, xfz - zfx])
 
 
-def open_box(walls: Walls) -> np.ndarray:
-    """Space around the domain that walls enclose [m], shape [3, 2]."""
+def open_box(walls: Walls, behind: float, above: float) -> np.ndarray:
+    """Space around the domain that walls enclose [m], shape [3, 2].
+
+    Args:
+        walls: Where the domain ends.
+        behind: Where the space begins along x [m].
+        above: Where it ends along z [m].
+    """
     return np.array(
         [
-            [_BEHIND, walls.ahead + _MARGIN],
+            [behind, walls.ahead + _MARGIN],
             [walls.right - _MARGIN, walls.left + _MARGIN],
-            [_BELOW, _ABOVE],
+            [_BELOW, above],
         ]
     )
 
