@@ -235,7 +235,7 @@ def change_of(played: Played, density: float) -> np.ndarray:
         played: The cycle.
         density: Bulk density [kg/m^3].
     """
-    change = played.after - played.before
+    change = played.after.astype(np.float64) - played.before
     gain, loss = np.maximum(change, 0.0), np.maximum(-change, 0.0)
     volume = played.mass / density / CELL_SIZE**2
     wanted = volume + gain.sum()

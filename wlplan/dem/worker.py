@@ -53,10 +53,12 @@ def run(job: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, np.ndar
         Arrays by name: the fields of `Bed` or of `dem.cycle.Played`.
     """
     settings = settings_from(job["settings"])
+    keep: type[np.floating[Any]]
     if job["kind"] == "bed":
         from wlplan.dem.bed import make_bed
 
         made: Any = make_bed(settings.grains, settings.time_step(np.inf))
+        keep = np.float64
     else:
         from wlplan.dem.cycle import play_cycle
 
@@ -69,7 +71,12 @@ def run(job: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, np.ndar
             settings=settings,
             walls=Walls(**job["walls"]),
         )
-    return {field.name: np.asarray(getattr(made, field.name)) for field in dataclasses.fields(made)}
+        # Maps and records of single precision take half the space.
+        keep = np.float32
+    values = {
+        field.name: np.asarray(getattr(made, field.name)) for field in dataclasses.fields(made)
+    }
+    return {name: value.astype(keep) if value.ndim else value for name, value in values.items()}
 
 
 def main(arguments: Sequence[str]) -> int:
