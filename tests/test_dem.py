@@ -196,6 +196,13 @@ def test_the_envelope_of_a_layer_is_its_top():
     assert np.abs(columns.centre_line(seen) - want)[inner].max() < 0.01
 
 
+def test_without_soil_the_maps_are_flat():
+    nothing = (np.zeros((0, 3)), np.zeros(0))
+    assert not columns.column_height(*nothing, 0.64).any()
+    assert not columns.envelope(*nothing).any()
+    assert packing.cut(lattice_bed(), 0.0 * ramp(), packing.Walls(), 0)[1].size == 0
+
+
 # --- packing
 
 

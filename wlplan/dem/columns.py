@@ -68,7 +68,7 @@ def envelope(centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
     # Fine cell [0, 0] is centred half a fine cell before the middle of cell [0, 0].
     u = cells_of(centre[:, 0], centre[:, 1]) * fine + (fine - 1) / 2
     nearest = np.round(u).astype(int)
-    reach = int(np.ceil(radius.max() / size))
+    reach = int(np.ceil(radius.max(initial=0.0) / size))
     top = np.zeros((count, count))
     for i in range(-reach, reach + 1):
         for j in range(-reach, reach + 1):

@@ -178,7 +178,7 @@ def run_job(
         except subprocess.TimeoutExpired as error:
             raise InputError(
                 f"the discrete-element engine took longer than {timeout:g} s and was stopped: "
-                f"give it more time, or a smaller pile."
+                f"give it an idle core, or more time by `Settings(timeout=...)`."
             ) from error
         except OSError as error:
             reason = error.strerror or one_line(error)
