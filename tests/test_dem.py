@@ -400,6 +400,17 @@ def test_it_drives_the_rollout_and_load_by_load_is_the_same(jobs):
     assert float(performance.mass) == pytest.approx(3.0)
 
 
+def test_it_is_mapped_over_poses(jobs):
+    world, pile, plan = DiscreteElements(), wide_pile(), plan_of(2)
+
+    def mass(pose, action):
+        return world(pile, pose, action)[1].mass
+
+    poses = plan.pose.replace(x=jnp.array([0.0, 0.3]))
+    assert np.allclose(jax.jit(jax.vmap(mass))(poses, plan.action), 3.0)
+    assert [job["kind"] for job, _ in jobs] == ["bed", "cycle", "cycle"]
+
+
 def test_a_derivative_is_refused(jobs):
     world, pile, plan = DiscreteElements(), wide_pile(), plan_of(1)
     with pytest.raises(InputError, match="no derivative"):
