@@ -527,6 +527,14 @@ def test_a_missing_engine_is_told_with_what_to_install(tmp_path, monkeypatch):
     assert list((tmp_path / "cache").iterdir()) == []
 
 
+def test_the_worker_is_of_this_package_whatever_its_python_has(tmp_path, monkeypatch):
+    (tmp_path / "wlplan").mkdir()
+    (tmp_path / "wlplan" / "__init__.py").write_text("raise SystemExit('another wlplan')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(InputError, match="'settings'"):
+        process.run_job({"kind": "bed"}, {}, timeout=60.0)
+
+
 def test_a_cache_that_cannot_be_made_is_told(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv(process.CACHE, str(tmp_path / "file" / "cache"))

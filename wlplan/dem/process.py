@@ -37,12 +37,20 @@ INTERPRETER = "WLPLAN_DEM_PYTHON"
 CACHE = "WLPLAN_CACHE"
 """Environment variable: folder of the cache, in place of the user's."""
 
-# The worker finds this package after all of its own: another Python has other compiled modules.
-_ROOT = str(Path(__file__).parents[2])
-_WORKER = (
-    f"import sys; sys.path.append({_ROOT!r}); "
-    "from wlplan.dem.worker import main; sys.exit(main(sys.argv[1:]))"
+# The worker takes this very package, and all else from its own Python: another one may have another
+# version of it, and has other compiled modules than those beside it here.
+_PACKAGE = Path(__file__).parents[1]
+_WORKER = f"""
+import sys
+from importlib.util import module_from_spec, spec_from_file_location
+spec = spec_from_file_location(
+    "wlplan", {str(_PACKAGE / "__init__.py")!r}, submodule_search_locations=[{str(_PACKAGE)!r}]
 )
+sys.modules["wlplan"] = module_from_spec(spec)
+spec.loader.exec_module(sys.modules["wlplan"])
+from wlplan.dem.worker import main
+sys.exit(main(sys.argv[1:]))
+"""
 # Surfaces are rounded to this [m], so that rounding errors do not make another job of the same.
 _ROUNDED = 1e-4
 
