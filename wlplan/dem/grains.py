@@ -22,7 +22,7 @@ class Grains:
     smallest: float = 0.80
     largest: float = 1.15
     # Normal and tangential stiffness [N/m] (linear springs) and restitution [1]. Estimate: soft
-    # enough for the time step; a sphere under 3 m of soil is pressed in by about 1 % of its radius.
+    # enough for the time step; under 3 m of soil a sphere gives way by about 4 % of its radius.
     stiffness: float = 5e5
     tangential_stiffness: float = 2.0 / 7.0 * 5e5
     restitution: float = 0.3
