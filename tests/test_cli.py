@@ -587,6 +587,7 @@ def test_no_command_shows_the_help(run):
 
 def test_the_names_offered_are_those_that_exist():
     assert cli.options.WORLDS == worlds.WORLDS
+    assert cli.options.ENGINES == worlds.ENGINES
     assert cli.options.PLANNERS == planner.PLANNERS
     assert tuple(objective.OBJECTIVES) == cli.options.OBJECTIVES
     assert tuple(io.scans._READERS) == cli.inputs.PILE_ENDINGS

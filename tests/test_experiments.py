@@ -17,10 +17,12 @@ from wlplan.characteristics import as_vector, characteristics
 from wlplan.types import LocalHeightmap
 
 ROOT = Path(__file__).parents[1]
+# What the others share, and the recipe of a data set: none has a result of its own.
+OTHERS = {"record", "replays", "dem_cycles"}
 NAMES = sorted(
     module.name
     for module in pkgutil.iter_modules(experiments.__path__)
-    if module.name not in ("record", "replays")
+    if module.name not in OTHERS
 )
 
 

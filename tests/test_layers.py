@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "wlplan"
 
 # From the bottom to the top: a module imports only from what stands before it.
 LAYERS = [
-    *("errors", "types", "units", "compilation"),
+    *("errors", "types", "units", "compilation", "io.files"),
     *("machine", "presets"),
     *("ground", "pile"),
     *("heightmap", "characteristics"),
@@ -19,6 +19,8 @@ LAYERS = [
     *("automaton.rounds", "automaton.relaxation", "automaton", "excavation"),
     *("simulator.controller", "simulator.soil", "simulator.loader", "simulator.terrain"),
     *("simulator.cycle", "simulator.trajectory", "simulator.world", "simulator"),
+    *("dem.grains", "dem.bucket", "dem.loader", "dem.columns", "dem.packing", "dem.engine"),
+    *("dem.bed", "dem.cycle", "dem.worker", "dem.process", "dem.world", "dem"),
     *("sampling", "dataset.variables", "dataset.protocol", "dataset.workbench", "dataset.worker"),
     *("dataset.crew", "dataset.batches", "dataset.store", "dataset.collecting", "dataset.merging"),
     "dataset",
@@ -26,7 +28,7 @@ LAYERS = [
     *("worlds", "horizon"),
     *("transport", "objective"),
     *("planner.toe", "planner.job", "planner.search", "planner.gradient", "planner"),
-    *("diggability", "gradcheck", "io.files", "io.plans", "io.scans", "io"),
+    *("diggability", "gradcheck", "io.plans", "io.scans", "io"),
     *(
         "plots.paper",
         "plots.relief",
@@ -38,7 +40,7 @@ LAYERS = [
     ),
     *("bench.timing", "bench.digs", "bench.baselines", "bench.setup", "bench.automata"),
     *("bench.rollouts", "bench.planning", "bench.items", "bench"),
-    *("cli.options", "cli.outputs", "cli.inputs", "cli.progress", "cli.played"),
+    *("cli.options", "cli.outputs", "cli.inputs", "cli.progress", "cli.played", "cli.engines"),
     *("cli.planning", "cli.maps", "cli.gradients", "cli.learning", "cli.benchmark"),
     *("cli", "__main__"),
 ]

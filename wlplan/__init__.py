@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from wlplan.automaton import relax as relax
+    from wlplan.dem.world import DiscreteElements as DiscreteElements
     from wlplan.diggability import DiggabilityMap as DiggabilityMap
     from wlplan.diggability import diggability_map as diggability_map
     from wlplan.errors import InputError as InputError
@@ -52,6 +53,7 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "automaton": ("relax",),
+    "dem.world": ("DiscreteElements",),
     "diggability": ("DiggabilityMap", "diggability_map"),
     "errors": ("InputError",),
     "horizon": ("rollout",),

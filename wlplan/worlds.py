@@ -10,6 +10,7 @@ from flax import struct
 
 from wlplan.automaton import DEFAULT_SCHEDULE, Schedule, settle_dug, window_of
 from wlplan.characteristics import as_vector, characteristics
+from wlplan.dem.world import DiscreteElements
 from wlplan.errors import InputError
 from wlplan.excavation import excavate
 from wlplan.heightmap import sample_local
@@ -22,7 +23,9 @@ from wlplan.types import Action, Performance, Pile, Pose, World, action_vector
 from wlplan.units import KG_PER_TONNE
 
 WORLDS = ("low", "high", "hybrid", "simulator")
-"""Names that `load_world` knows."""
+"""Names that `load_world` knows, to plan in."""
+ENGINES = ("simulator", "dem")
+"""Names that `load_world` knows, to play plans in; "dem" is too slow to plan in."""
 
 
 @no_type_check
@@ -68,7 +71,8 @@ def load_world(
 
     Args:
         name: "low" (ψ_low and the automaton) or "simulator"; "high" and "hybrid" need models that
-            are not part of the package yet.
+            are not part of the package yet. "dem" is the discrete-element engine, which takes
+            minutes a loading, has no derivative, and needs `pip install 'wlplan[dem]'`.
         model: Directory of a trained model to use in place of the pretrained one.
         soil: What is dug. A learned world takes from it the density, by which it turns mass into
             volume, and the angle of repose; what it predicts is for the soil of its training.
@@ -82,6 +86,8 @@ def load_world(
     check_machine(machine)
     if name == "simulator":
         return Simulator(machine=machine, soil=soil)
+    if name == "dem":
+        return DiscreteElements(machine=machine, soil=soil)
     if name == "low":
         directory = pretrained_path("psi_low") if model is None else Path(model)
         return LowWorld(load_model(directory), machine=machine, soil=soil)
@@ -89,4 +95,6 @@ def load_world(
         raise InputError(
             f"the {name} world needs ψ_high, which is not trained yet; use low or simulator"
         )
-    raise InputError(f"unknown world {name!r}; choose one of {', '.join(WORLDS)}")
+    raise InputError(
+        f"unknown world {name!r}; choose one of {', '.join(dict.fromkeys((*WORLDS, *ENGINES)))}"
+    )

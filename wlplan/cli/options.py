@@ -14,6 +14,7 @@ from wlplan.units import ACTION_HIGH, ACTION_LOW
 
 # Names that the modules behind define, repeated here to keep help fast; a test compares them.
 WORLDS = ("low", "high", "hybrid", "simulator")
+ENGINES = ("simulator", "dem")
 PLANNERS = ("gradient", "greedy", "nominal")
 OBJECTIVES = ("efficiency", "productivity", "energy")
 
@@ -177,6 +178,13 @@ world_option = click.option(
     default="low",
     show_default=True,
     help="What predicts: a learned world or the simulator.",
+)
+engine_option = click.option(
+    "--engine",
+    type=click.Choice(ENGINES),
+    default=ENGINES[0],
+    show_default=True,
+    help="What plays: the simulator or discrete elements (minutes a load; wlplan[dem]).",
 )
 model_option = click.option(
     "--model",

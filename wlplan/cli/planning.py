@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from wlplan.cli.engines import play_in
 from wlplan.cli.inputs import (
     RECEIVER_FIELDS,
     check_model,
@@ -23,6 +24,7 @@ from wlplan.cli.inputs import (
 from wlplan.cli.options import (
     OBJECTIVES,
     PLANNERS,
+    engine_option,
     loads_option,
     model_option,
     objective_option,
@@ -207,26 +209,26 @@ def _write_plan(
 @click.command()
 @click.argument("pile_file", metavar="PILE")
 @click.argument("plan_file", metavar="PLAN.json")
-@with_options(truck_option, *site_options("that of the plan"))
+@with_options(engine_option, truck_option, *site_options("that of the plan"))
 def simulate(
     pile_file: str,
     plan_file: str,
+    engine: str,
     truck: tuple[float, ...] | None,
     soil: str | None,
     machine: str | None,
     seed: int,
     as_json: bool,
 ) -> None:
-    """Play PLAN.json in the simulator on PILE and compare with what was predicted.
+    """Play PLAN.json in an engine on PILE and compare with what was predicted.
 
-    Truck, soil and machine are those of the plan, unless given. The simulator has no randomness, so
-    --seed changes nothing.
+    Truck, soil and machine are those of the plan, unless given. No engine has randomness, so
+    --seed changes nothing. Interrupted with --engine dem, the same command goes on where it was.
     """
     check_pile_name(pile_file)
     site_named(soil, machine)  # wrong options are refused before anything heavy is imported
 
     from wlplan.io import plan_to_dict, read_plan
-    from wlplan.planner import play
 
     loading_plan, given = read_plan(plan_file)
     pile, source = pile_named(pile_file)
@@ -241,10 +243,10 @@ def simulate(
     objective = objective if objective in OBJECTIVES else OBJECTIVES[0]
     receiver = receiver_at(pile, truck if truck is not None else _truck_of(given))
     with Progress() as progress, Stopwatch() as playing:
-        progress("simulator", 0, 1, None)
-        simulator = world_named("simulator", site)
-        played = ready(play(simulator, pile, loading_plan, objective=objective, receiver=receiver))
-        progress("simulator", 1, 1, None)
+        world = world_named(engine, site)
+        played, cycles = play_in(
+            world, pile, loading_plan, objective=objective, receiver=receiver, progress=progress
+        )
 
     predicted = _predicted_of(given)
     total = {
@@ -264,15 +266,18 @@ def simulate(
         objective=objective,
         receiver=receiver_fields(receiver),
         total=total,
-        ledger=ledger_of(pile, played, simulator),
+        ledger=ledger_of(pile, played, world),
+        **({} if cycles is None else {"engine": engine}),
     )
+    for load, cycle in zip(document["loads"], cycles or (), strict=False):
+        load["cycle"] = cycle
     text = json_text(document)
     remark_on_ledger(document["ledger"])
     if as_json:
         click.echo(text)
         return
     print_plan(document)
-    print(f"simulator {playing.text()}")
+    print(f"{engine} {playing.text()}")
 
 
 def _truck_of(document: Mapping[str, Any]) -> tuple[float, ...] | None:

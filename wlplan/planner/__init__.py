@@ -8,16 +8,17 @@ from typing import Any
 import jax
 import numpy as np
 
+from wlplan.dem.world import DiscreteElements
 from wlplan.errors import InputError
 from wlplan.objective import Objective, objective_named
 from wlplan.pile import ToeContour, toe_contour
 from wlplan.planner.gradient import GradientSettings, gradient
-from wlplan.planner.job import Decisions, Job, Outcome, ToeJob, outcomes, played
+from wlplan.planner.job import Decisions, Job, Outcome, ToeJob, judged, outcomes, played
 from wlplan.planner.search import Progress, SearchSettings, greedy, nominal
 from wlplan.planner.toe import toe_of
 from wlplan.simulator import Simulator
 from wlplan.transport import Receiver, default_receiver
-from wlplan.types import LoadingPlan, Pile, World
+from wlplan.types import LoadingPlan, Pile, Rollout, World
 
 __all__ = [
     "PLANNERS",
@@ -25,6 +26,7 @@ __all__ = [
     "PlanResult",
     "Progress",
     "SearchSettings",
+    "judge",
     "plan_loads",
     "play",
 ]
@@ -99,7 +101,7 @@ def plan_loads(
     if _has_no_gradient(world):
         if planner == "gradient":
             raise InputError(
-                "the simulator world plays without derivatives, which the gradient planner needs; "
+                "this world plays without derivatives, which the gradient planner needs; "
                 "plan in a model, or use the greedy or the nominal planner"
             )
         settings = WITHOUT_GRADIENT if settings is None else settings
@@ -144,7 +146,37 @@ def play(
     return _member(played(job, jax.tree.map(lambda leaf: leaf[None], plan)), 0)
 
 
+def judge(
+    outcome: Rollout,
+    pile: Pile,
+    plan: LoadingPlan,
+    *,
+    objective: str | Objective = "efficiency",
+    receiver: Receiver | None = None,
+) -> PlanResult:
+    """What a plan costs that was played elsewhere, load by load.
+
+    Args:
+        outcome: What came of it.
+        pile: The pile before the first loading.
+        plan: Poses and actions.
+        objective: Name or weights.
+        receiver: Where the loads go; default: the follow-up's place relative to the pile.
+    """
+    return _judged(
+        default_receiver(pile) if receiver is None else receiver,
+        objective_named(objective),
+        plan,
+        outcome,
+    )
+
+
+_judged = jax.jit(judged, static_argnums=1)
+
+
 def _has_no_gradient(world: World) -> bool:
+    if isinstance(world, DiscreteElements):
+        return True
     return isinstance(world, Simulator) and not world.settings.differentiable
 
 

@@ -80,11 +80,14 @@ def decide(job: ToeJob, pile: Pile, decisions: Decisions) -> tuple[Pose, Action]
     return pose_at(job.toe, pile, decisions.position, decisions.offset), squash(decisions.action)
 
 
-def _judged(job: Job, plan: LoadingPlan, outcome: Rollout) -> Outcome:
-    time, work = jax.vmap(lambda pose, mass: transport(pose, job.receiver, mass))(
+def judged(
+    receiver: Receiver, objective: Objective, plan: LoadingPlan, outcome: Rollout
+) -> Outcome:
+    """A plan that was played, with its transport and its cost."""
+    time, work = jax.vmap(lambda pose, mass: transport(pose, receiver, mass))(
         plan.pose, outcome.performance.mass
     )
-    costs = loading_cost(job.objective, outcome.performance, time, work)
+    costs = loading_cost(objective, outcome.performance, time, work)
     return Outcome(
         plan=plan,
         rollout=outcome,
@@ -100,7 +103,7 @@ def play_decisions(job: ToeJob, decisions: Decisions) -> Outcome:
     outcome, plan = closed_loop(
         job.world, job.pile, decisions, lambda pile, d: decide(job, pile, d)
     )
-    return _judged(job, plan, outcome)
+    return judged(job.receiver, job.objective, plan, outcome)
 
 
 def play_plan(job: Job, plan: LoadingPlan) -> Outcome:
@@ -108,7 +111,7 @@ def play_plan(job: Job, plan: LoadingPlan) -> Outcome:
     outcome, plan = closed_loop(
         job.world, job.pile, plan, lambda _, loading: (loading.pose, loading.action)
     )
-    return _judged(job, plan, outcome)
+    return judged(job.receiver, job.objective, plan, outcome)
 
 
 def cost_of_one(job: ToeJob, pile: Pile, decisions: Decisions) -> Float[Array, ""]:
