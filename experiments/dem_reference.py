@@ -51,6 +51,7 @@ MACHINE = dataclasses.replace(
     boom_speed=0.23,
     tilt_speed=0.55,
     tilt_moment=220e3,
+    bucket_heaped=3.05,
 )
 _UNITS = {"mass": "t", "time": "s", "work": "kJ"}
 # Soil slides in from beyond the local map: it is carried on by this many cells while it does.

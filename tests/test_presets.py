@@ -28,7 +28,8 @@ from wlplan.types import Action
 from wlplan.units import CELL_SIZE
 
 FITTED = (
-    *("edge_resistance", "content_push", "content_carry", "intrusion_stiffness", "slide_rate"),
+    *("fill_factor", "edge_resistance", "content_push", "content_carry"),
+    *("intrusion_stiffness", "slide_rate"),
 )
 SOIL_FIELDS = [field.name for field in dataclasses.fields(Soil)]
 MACHINE_FIELDS = [field.name for field in dataclasses.fields(WheelLoader)]
@@ -291,7 +292,7 @@ def test_denser_soil_means_more_mass(loaded):
 
 
 def test_a_narrower_bucket_loads_less(loaded):
-    narrow = dataclasses.replace(WA320, bucket_width=1.8, bucket_heaped=2.8 * 1.8 / 2.7)
+    narrow = dataclasses.replace(WA320, bucket_width=1.8, bucket_heaped=3.0 * 1.8 / 2.7)
     assert 0.0 < loaded(machine=narrow) < 0.9 * loaded()
 
 

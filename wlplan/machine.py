@@ -46,9 +46,8 @@ class WheelLoader:
     # Height of the side plates over the floor, mean over their length [m]. Estimate from the
     # brochure's side view.
     side_height: float = 0.85
-    # Heaped volume [m^3]. Estimate: about 3 by the brochure, less here so that the fullest load,
-    # 4.8 t of gravel, comes near the largest of the paper's data set, 4.5 t (its appendix A).
-    bucket_heaped: float = 2.8
+    # Heaped volume [m^3]. Brochure: about 3 over the range of buckets.
+    bucket_heaped: float = 3.0
     # Height of the boom pivot above the ground [m], and boom length to the bucket pin [m].
     # Brochure drawing: 1.9 to 1.95 and 2.6 to 2.7.
     pivot_height: float = 1.90
@@ -90,6 +89,8 @@ class Soil:
     adhesion: float = 0.0
 
     # Fitted to the forces and loads of discrete-element cycles, see docs/simulator.md.
+    # Most that the bucket takes over its heaped volume [1]: the bucket fill factor.
+    fill_factor: float = 0.92
     # Resistance to the cutting edge a metre of width [N/m].
     edge_resistance: float = 4_500.0
     # Push of a level bucket's content against the pile ahead, and weight of the soil that is

@@ -70,6 +70,7 @@ _SOIL_RANGES = {
     "cohesion": _Range(0.0, 100e3, "Pa"),
     "steel_friction": _Range(0.0, 60.0, "°"),
     "adhesion": _Range(0.0, 100e3, "Pa"),
+    "fill_factor": _Range(0.1, 2.0, ""),
     "edge_resistance": _Range(0.0, 1e6, "N/m"),
     "content_push": _Range(0.0, 20.0, ""),
     "content_carry": _Range(0.0, 20.0, ""),

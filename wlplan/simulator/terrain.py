@@ -135,10 +135,12 @@ def _read(field: Float[Array, "n lanes b"], centre: Float[Array, " b"]) -> Float
     return total(weight[:, None] * jnp.take_along_axis(field, rows[:, None], axis=0))
 
 
-def fullness(machine: WheelLoader, fill: Float[Array, "lanes b"]) -> Float[Array, "lanes b"]:
-    """Fill of each lane over what the heaped bucket holds there [1]."""
-    heaped = machine.bucket_heaped / machine.bucket_width
-    return fill / jnp.asarray(_least(Lanes(machine).width) * heaped, fill.dtype)
+def fullness(
+    machine: WheelLoader, soil: Soil, fill: Float[Array, "lanes b"]
+) -> Float[Array, "lanes b"]:
+    """Fill of each lane over the most of this soil that the bucket takes there [1]."""
+    most = soil.fill_factor * machine.bucket_heaped / machine.bucket_width
+    return fill / jnp.asarray(_least(Lanes(machine).width) * most, fill.dtype)
 
 
 def _least(width: np.ndarray) -> np.ndarray:
@@ -179,7 +181,7 @@ def reaction(
     depth = jnp.maximum(near - bucket.z[None], 0.0)
     slope = jnp.clip(jnp.arctan((far - near) / _SLOPE_LENGTH), _LEAST_SLOPE, _GREATEST_SLOPE)
     # Soil in a lane covers the floor that would cut.
-    bare = jnp.maximum(1.0 - fullness(machine, fill), 0.0)
+    bare = jnp.maximum(1.0 - fullness(machine, soil, fill), 0.0)
     rake = jnp.clip(bucket.tilt[None] + slope, _LEAST_RAKE, _GREATEST_RAKE)
     pressed = bucket.tilt + soil.steel_friction
     wedge = wedge_of(depth * jnp.cos(slope), rake, slope, soil.steel_friction, soil=soil)
@@ -281,8 +283,8 @@ def move(
     lane = lanes.spread(width / CELL_SIZE)[None]
 
     # A lane takes in what the soil already there leaves open of its mouth; the rest is pushed.
-    # d fill = (1 - fullness^2) d cut gives fill = heaped * tanh(cut / heaped).
-    open_part = jnp.maximum(1.0 - fullness(machine, fill) ** 2, 0.0)
+    # d fill = (1 - fullness^2) d cut gives fill = most * tanh(cut / most).
+    open_part = jnp.maximum(1.0 - fullness(machine, soil, fill) ** 2, 0.0)
 
     # The edge cuts each cell down to its path. While it crosses a cell, the part passed in this
     # step is taken out of what is left of the cell, so the volume does not depend on the grid.
