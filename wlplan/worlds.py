@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
-from typing import no_type_check
+from typing import Any, no_type_check
 
 from flax import struct
 
@@ -15,6 +15,7 @@ from wlplan.excavation import excavate
 from wlplan.heightmap import sample_local
 from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
 from wlplan.models.performance import PerformanceModel
+from wlplan.models.performance_high import HighPerformanceModel
 from wlplan.presets import check_machine, check_soil
 from wlplan.simulator import Simulator
 from wlplan.training import load_model
@@ -41,20 +42,55 @@ class LowWorld(struct.PyTreeNode):
         """
         local = characteristics(sample_local(pile, pose))
         predicted = self.model(as_vector(local), action_vector(action))
-        window, start = window_of(pile, pose)
-        per_volume = self.soil.density / KG_PER_TONNE
-        dug, volume = excavate(
-            window, pose, predicted.mass / per_volume, width=self.machine.bucket_width
-        )
-        after = settle_dug(
-            pile, dug.height, start, repose_angle=self.soil.repose_angle, schedule=self.schedule
-        )
-        return after, predicted.replace(mass=volume * per_volume)
+        return _dug_and_settled(self, pile, pose, predicted)
+
+
+@no_type_check
+class HybridWorld(struct.PyTreeNode):
+    """The hybrid world: ψ_high, mass removal along the strip, automaton. Paper, 4.6."""
+
+    model: HighPerformanceModel
+    machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
+    soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
+    schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
+
+    def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+        """The pile and the performance after one loading.
+
+        Where the strip holds less than the model predicts, the load is what is there.
+        """
+        predicted = self.model(sample_local(pile, pose), action_vector(action))
+        return _dug_and_settled(self, pile, pose, predicted)
+
+
+def _dug_and_settled(
+    world: LowWorld | HybridWorld, pile: Pile, pose: Pose, predicted: Performance
+) -> tuple[Pile, Performance]:
+    """Takes the predicted mass out of the strip in front of the bucket and lets the rest slide."""
+    window, start = window_of(pile, pose)
+    per_volume = world.soil.density / KG_PER_TONNE
+    dug, volume = excavate(
+        window, pose, predicted.mass / per_volume, width=world.machine.bucket_width
+    )
+    after = settle_dug(
+        pile, dug.height, start, repose_angle=world.soil.repose_angle, schedule=world.schedule
+    )
+    return after, predicted.replace(mass=volume * per_volume)
 
 
 def pretrained_path(name: str) -> Path:
     """Directory of the weights that ship with the package."""
     return Path(str(resources.files("wlplan") / "pretrained" / name))
+
+
+def _model_directory(kind: str, world: str, model: str | Path | None) -> Path:
+    directory = pretrained_path(kind) if model is None else Path(model)
+    if model is None and not directory.is_dir():
+        raise InputError(
+            f"the {world} world needs {kind}, which does not ship yet: name a trained one, or use "
+            f"low or simulator"
+        )
+    return directory
 
 
 def load_world(
@@ -67,8 +103,8 @@ def load_world(
     """A world by name.
 
     Args:
-        name: "low" (ψ_low and the automaton) or "simulator"; "high" and "hybrid" need models that
-            are not part of the package yet.
+        name: "low" (ψ_low and the automaton), "hybrid" (ψ_high and the automaton; its weights do
+            not ship yet) or "simulator"; "high" needs a pile state model, not trained yet.
         model: Directory of a trained model to use in place of the pretrained one.
         soil: What is dug. A learned world takes from it the density, by which it turns mass into
             volume, and the angle of repose; what it predicts is for the soil of its training.
@@ -84,9 +120,12 @@ def load_world(
         return Simulator(machine=machine, soil=soil)
     if name == "low":
         directory = pretrained_path("psi_low") if model is None else Path(model)
-        return LowWorld(load_model(directory), machine=machine, soil=soil)
-    if name in WORLDS:
-        raise InputError(
-            f"the {name} world needs ψ_high, which is not trained yet; use low or simulator"
-        )
+        low: Any = load_model(directory)
+        return LowWorld(low, machine=machine, soil=soil)
+    if name == "hybrid":
+        directory = _model_directory("psi_high", name, model)
+        high: Any = load_model(directory, "psi_high")
+        return HybridWorld(high, machine=machine, soil=soil)
+    if name == "high":
+        raise InputError("the high world needs φ, which is not trained yet; use low or simulator")
     raise InputError(f"unknown world {name!r}; choose one of {', '.join(WORLDS)}")

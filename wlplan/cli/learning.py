@@ -10,7 +10,14 @@ import click
 from click.core import ParameterSource
 
 from wlplan.cli.inputs import check_is_folder, check_model, site_named
-from wlplan.cli.options import ShardNumber, site_options, with_options
+from wlplan.cli.options import (
+    ACTIVATIONS,
+    ENCODERS,
+    LayerUnits,
+    ShardNumber,
+    site_options,
+    with_options,
+)
 from wlplan.cli.outputs import QUANTITIES, checked_folder, json_text, print_table, titled_table
 from wlplan.cli.progress import Progress, Stopwatch
 from wlplan.errors import InputError
@@ -112,34 +119,86 @@ def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
     print(f"{cycles} cycles of {len(parts)} {'shard' if len(parts) == 1 else 'shards'} in {out}")
 
 
+# Names of the models on the command line.
+_KINDS = ("psi-low", "psi-high")
+
+
 @click.command()
-@click.argument("kind", metavar="MODEL", type=click.Choice(("psi-low",)))
+@click.argument("kind", metavar="MODEL", type=click.Choice(_KINDS))
 @with_options(
     click.option("--data", metavar="DATA.zarr", required=True, help="Data set to train on."),
     click.option("--out", metavar="DIR", required=True, help="Folder of the model."),
     click.option(
         "--epochs",
         type=click.IntRange(1, 100_000),
-        default=300,
+        default=150,
         show_default=True,
         help="Passes over the data.",
     ),
+    click.option(
+        "--activation",
+        type=click.Choice(ACTIVATIONS),
+        default=ACTIVATIONS[0],
+        show_default=True,
+        help="Activation function.",
+    ),
+    click.option(
+        "--hidden",
+        type=LayerUnits(),
+        default="512,512",
+        show_default=True,
+        help="Units of each hidden layer; psi-high in the paper: 2048,2048.",
+    ),
+    click.option(
+        "--dropout",
+        type=click.FloatRange(0.0, 1.0, max_open=True),
+        default=None,
+        help="Part of the hidden units dropped. Default: psi-low 0.02, psi-high 0.1.",
+    ),
+    click.option(
+        "--encoder",
+        type=click.Choice(ENCODERS),
+        default=None,
+        help="psi-high: what tells it about the map, the paper's convolutions or (default) ours.",
+    ),
 )
-def train(kind: str, data: str, out: str, epochs: int, seed: int, as_json: bool) -> None:
-    """Train MODEL (psi-low) on a data set and report its errors on cycles that it has not seen."""
+def train(
+    kind: str,
+    data: str,
+    out: str,
+    epochs: int,
+    activation: str,
+    hidden: tuple[int, ...],
+    dropout: float | None,
+    encoder: str | None,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Train MODEL (psi-low or psi-high) on a data set and report its errors on unseen cycles.
+
+    Interrupted, the same command goes on where it stopped.
+    """
     check_is_folder(data, "data set", "wlplan collect")
     checked_folder(out)
+    if encoder is not None and kind != "psi-high":
+        raise InputError(f"--encoder does not go with {kind}: leave it out.")
+    chosen = {"dropout": dropout, "encoder": encoder}
+    settings = {name: value for name, value in chosen.items() if value is not None}
 
     from wlplan.dataset import open_dataset
-    from wlplan.training import train_psi_low
+    from wlplan.training import train_psi_high, train_psi_low
 
     dataset = open_dataset(data)
+    trainer: Any = train_psi_low if kind == "psi-low" else train_psi_high
     with Progress() as progress, Stopwatch() as training:
-        _, report = train_psi_low(
+        _, report = trainer(
             dataset,
             out=out,
             seed=seed,
             epochs=epochs,
+            activation=activation,
+            hidden=hidden,
+            **settings,
             progress=lambda done, total: progress("epochs", done, total, None),
         )
     if as_json:
@@ -167,19 +226,21 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     check_model(model, "low")
 
     from wlplan.dataset import open_dataset
-    from wlplan.training import evaluate_psi_low, held_out, load_model, read_description
+    from wlplan.training import evaluate_performance, held_out, load_model, read_description
     from wlplan.worlds import pretrained_path
 
     folder = pretrained_path("psi_low") if model is None else Path(model)
-    description, predictor = read_description(folder), load_model(folder)
+    description = read_description(folder, kind=None)
+    predictor = load_model(folder, description["kind"])
+    kind = description["kind"].replace("_", "-")
     dataset = open_dataset(data)
     part = held_out(dataset, description)
-    report = evaluate_psi_low(predictor, part).as_dict()
+    report = evaluate_performance(predictor, part).as_dict()
     if as_json:
-        click.echo(json_text({"model": "psi-low", "data": data, "errors": report}))
+        click.echo(json_text({"model": kind, "data": data, "errors": report}))
         return
     which = "held-out part" if len(part) < len(dataset) else "all cycles"
-    _print_errors(f"psi-low, {which} of {data}", report)
+    _print_errors(f"{kind}, {which} of {data}", report)
 
 
 def _print_errors(title: str, report: Mapping[str, Any]) -> None:
