@@ -86,7 +86,7 @@ def test_components_of_mirrored_maps_are_the_same_or_opposite():
     encoder = PrincipalComponents()
     encoder.fit(maps)
     basis = np.asarray(encoder.basis[...])
-    np.testing.assert_allclose(basis.T @ basis, np.eye(24), atol=1e-4)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(24), atol=1e-3)
     # The others may mix within pairs of like variance.
     first = encoder(maps[3])[0], encoder(maps[3, :, ::-1])[0]
     assert float(abs(first[0])) == pytest.approx(float(abs(first[1])), rel=1e-3)

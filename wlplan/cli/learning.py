@@ -120,7 +120,7 @@ def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
 
 
 # Names of the models on the command line.
-_KINDS = ("psi-low", "psi-high")
+_KINDS = ("psi-low", "psi-high", "phi", "phi-vae")
 
 
 @click.command()
@@ -131,29 +131,26 @@ _KINDS = ("psi-low", "psi-high")
     click.option(
         "--epochs",
         type=click.IntRange(1, 100_000),
-        default=150,
-        show_default=True,
-        help="Passes over the data.",
+        default=None,
+        help="Passes over the data. Default: psi-low, psi-high 150, phi 100, phi-vae twice 40.",
     ),
     click.option(
         "--activation",
         type=click.Choice(ACTIVATIONS),
-        default=ACTIVATIONS[0],
-        show_default=True,
-        help="Activation function.",
+        default=None,
+        help="Activation function. Default: swish; of phi-vae it is leaky_relu.",
     ),
     click.option(
         "--hidden",
         type=LayerUnits(),
-        default="512,512",
-        show_default=True,
-        help="Units of each hidden layer; psi-high in the paper: 2048,2048.",
+        default=None,
+        help="Units of each hidden layer. Default: 512,512; phi-vae 1024,1024.",
     ),
     click.option(
         "--dropout",
         type=click.FloatRange(0.0, 1.0, max_open=True),
         default=None,
-        help="Part of the hidden units dropped. Default: psi-low 0.02, psi-high 0.1.",
+        help="Part of the hidden units dropped. Default: psi-low 0.02, phi 0.05, others 0.1.",
     ),
     click.option(
         "--encoder",
@@ -166,15 +163,18 @@ def train(
     kind: str,
     data: str,
     out: str,
-    epochs: int,
-    activation: str,
-    hidden: tuple[int, ...],
+    epochs: int | None,
+    activation: str | None,
+    hidden: tuple[int, ...] | None,
     dropout: float | None,
     encoder: str | None,
     seed: int,
     as_json: bool,
 ) -> None:
-    """Train MODEL (psi-low or psi-high) on a data set and report its errors on unseen cycles.
+    """Train MODEL on a data set and report its errors on cycles that it has not seen.
+
+    MODEL is psi-low or psi-high, which predict the performance, phi, which predicts the pile state,
+    or phi-vae, which does so as in the paper.
 
     Interrupted, the same command goes on where it stopped.
     """
@@ -182,29 +182,38 @@ def train(
     checked_folder(out)
     if encoder is not None and kind != "psi-high":
         raise InputError(f"--encoder does not go with {kind}: leave it out.")
-    chosen = {"dropout": dropout, "encoder": encoder}
+    if activation is not None and kind == "phi-vae":
+        raise InputError(f"--activation does not go with {kind}: leave it out.")
+    chosen = {
+        "epochs": epochs,
+        "activation": activation,
+        "hidden": hidden,
+        "dropout": dropout,
+        "encoder": encoder,
+    }
     settings = {name: value for name, value in chosen.items() if value is not None}
 
+    from wlplan import training as trainers
     from wlplan.dataset import open_dataset
-    from wlplan.training import train_psi_high, train_psi_low
 
     dataset = open_dataset(data)
-    trainer: Any = train_psi_low if kind == "psi-low" else train_psi_high
+    trainer: Any = getattr(trainers, f"train_{kind.replace('-', '_')}")
     with Progress() as progress, Stopwatch() as training:
         _, report = trainer(
             dataset,
             out=out,
             seed=seed,
-            epochs=epochs,
-            activation=activation,
-            hidden=hidden,
             **settings,
             progress=lambda done, total: progress("epochs", done, total, None),
         )
     if as_json:
         click.echo(json_text({"model": kind, "out": out, "held_out": report.as_dict()}))
         return
-    _print_errors(f"{kind}, held-out part of {data}", report.as_dict())
+    title = f"{kind}, held-out part of {data}"
+    if kind.startswith("phi"):
+        _print_pile_state(title, [("", report.as_dict())])
+    else:
+        _print_errors(title, report.as_dict())
     print(f"training {training.text()}")
     print(f"written: {out}")
 
@@ -226,21 +235,63 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     check_model(model, "low")
 
     from wlplan.dataset import open_dataset
-    from wlplan.training import evaluate_performance, held_out, load_model, read_description
+    from wlplan.training import (
+        evaluate_performance,
+        evaluate_pile_state,
+        held_out,
+        load_model,
+        read_description,
+    )
     from wlplan.worlds import pretrained_path
 
     folder = pretrained_path("psi_low") if model is None else Path(model)
     description = read_description(folder, kind=None)
-    predictor = load_model(folder, description["kind"])
+    predictor: Any = load_model(folder, description["kind"])
     kind = description["kind"].replace("_", "-")
     dataset = open_dataset(data)
     part = held_out(dataset, description)
+    which = "held-out part" if len(part) < len(dataset) else "all cycles"
+    title = f"{kind}, {which} of {data}"
+    if kind.startswith("phi"):
+        # Of the paper's predictor also without its post-processing.
+        ways = {"": True} if kind == "phi" else {"edges blended": True, "as predicted": False}
+        rows = [
+            (name, evaluate_pile_state(predictor, part, blend=blend).as_dict())
+            for name, blend in ways.items()
+        ]
+        if as_json:
+            errors = rows[0][1] | ({"without_blending": rows[1][1]} if len(rows) > 1 else {})
+            click.echo(json_text({"model": kind, "data": data, "errors": errors}))
+        else:
+            _print_pile_state(title, rows)
+        return
     report = evaluate_performance(predictor, part).as_dict()
     if as_json:
         click.echo(json_text({"model": kind, "data": data, "errors": report}))
         return
-    which = "held-out part" if len(part) < len(dataset) else "all cycles"
-    _print_errors(f"{kind}, {which} of {data}", report)
+    _print_errors(title, report)
+
+
+# Table 2 of the paper: mean absolute [m³] and mean relative error.
+_PAPER = (("paper, edges blended", 0.75, 0.0304), ("paper, as predicted", 0.84, 0.0341))
+
+
+def _print_pile_state(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
+    """Errors of a pile state predictor, beside the paper's on the paper's data."""
+    table = titled_table(title)
+    for column in ("", "cycles", "misplaced volume", "relative to the pile", "volume removed"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, errors in rows:
+        table.add_row(
+            name or "ours",
+            str(errors["cycles"]),
+            f"{errors['mean_absolute']:.3f} m³",
+            f"{100.0 * errors['mean_relative']:.2f} %",
+            f"{100.0 * errors['total_volume']:+.2f} %",
+        )
+    for name, absolute, relative in _PAPER:
+        table.add_row(name, "", f"{absolute:.2f} m³", f"{100.0 * relative:.2f} %", "")
+    print_table(table)
 
 
 def _print_errors(title: str, report: Mapping[str, Any]) -> None:

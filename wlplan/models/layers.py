@@ -176,3 +176,24 @@ def _interpolation(before: int, after: int) -> np.ndarray:
     """Matrix that interpolates `before` points linearly at `after` points, ends on ends."""
     places = np.linspace(0.0, before - 1.0, after)
     return np.stack([np.interp(places, range(before), row) for row in np.eye(before)], axis=1)
+
+
+def principal_components(rows: Float[Array, "n k"], count: int) -> Float[Array, "k m"]:
+    """The directions of most variance of centred rows, orthonormal; zeros where there are no more.
+
+    Args:
+        rows: Table with mean 0 in each column.
+        count: Number of components, m.
+    """
+    n, k = rows.shape
+    # The smaller of the two squares of the table has the same eigenvalues.
+    if n < k:
+        values, vectors = jnp.linalg.eigh(rows @ rows.T)
+        lengths = jnp.sqrt(jnp.maximum(values, 0.0))
+        told = lengths > 1e-5 * lengths[-1]
+        scale = jnp.where(told, 1.0 / jnp.where(told, lengths, 1.0), 0.0)
+        vectors = rows.T @ (vectors * jnp.broadcast_to(scale, vectors.shape))
+    else:
+        _, vectors = jnp.linalg.eigh(rows.T @ rows)
+    found = vectors[:, ::-1][:, :count]
+    return jnp.pad(found, ((0, 0), (0, count - found.shape[1])))

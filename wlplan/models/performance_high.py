@@ -22,6 +22,7 @@ from wlplan.models.layers import (
     check_activation,
     max_pool,
     patches,
+    principal_components,
     resize,
     soft_clamp,
 )
@@ -55,8 +56,7 @@ class PrincipalComponents(nnx.Module):
         """Takes the components from the maps of the training data and their mirror images."""
         rows = jnp.concatenate([maps, maps[:, :, ::-1]]).reshape(-1, PERFORMANCE_CELLS**2)
         centred = rows - jnp.broadcast_to(rows.mean(axis=0), rows.shape)
-        _, vectors = jnp.linalg.eigh(centred.T @ centred)
-        self.basis[...] = vectors[:, ::-1][:, :_COMPONENTS]
+        self.basis[...] = principal_components(centred, _COMPONENTS)
 
     def __call__(self, maps: Float[Array, "*batch 36 36"]) -> Float[Array, "*batch k"]:
         """The components of maps, each by its root mean square over the map."""

@@ -21,7 +21,7 @@ from wlplan.models.performance import PerformanceModel, PsiLow
 from wlplan.models.performance_high import HighPerformanceModel, PsiHigh
 from wlplan.training.evaluation import EvaluationReport, evaluate_performance
 from wlplan.training.fitting import Recipe, SavedState, fitted
-from wlplan.training.storage import Model, architecture, check_target, save_model
+from wlplan.training.storage import architecture, check_target, save_model
 from wlplan.types import PyTree
 
 # Training, validation and test. Paper, section 6.4: 10,718 cycles, 1,072 of them for the test,
@@ -257,7 +257,10 @@ def _trained(
 
 
 def _finished(
-    model: Model, dataset: Dataset, data: _Prepared, record: dict[str, Any]
+    model: PerformanceModel | HighPerformanceModel,
+    dataset: Dataset,
+    data: _Prepared,
+    record: dict[str, Any],
 ) -> EvaluationReport:
     """Evaluates the model and saves it."""
     report = evaluate_performance(model, data.parts[2])

@@ -21,50 +21,56 @@ from flax import nnx
 
 from wlplan.dataset import versions
 from wlplan.errors import InputError
+from wlplan.models.height_change import HeightChange, HeightChangeModel
 from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel, PsiLow
 from wlplan.models.performance_high import HighPerformanceModel, PsiHigh
+from wlplan.models.pile_state import Phi, PileStateModel
 
 MODEL_FORMAT = "wlplan.model/1"
 
-Model = PerformanceModel | HighPerformanceModel
+Model = PerformanceModel | HighPerformanceModel | HeightChangeModel | PileStateModel
 
 _DESCRIPTION, _WEIGHTS = "model.json", "weights"
 
-# Normalisers of each kind of model, and the numbers in each.
-_NORMALISERS = {
-    "psi_low": {"inputs": INPUTS, "outputs": OUTPUTS},
-    "psi_high": {"maps": 1, "inputs": INPUTS, "outputs": OUTPUTS},
+# Of each kind: the model, its network, and the normalisers with the numbers in each.
+_KINDS: dict[str, tuple[Any, Any, dict[str, int]]] = {
+    "psi_low": (PerformanceModel, PsiLow, {"inputs": INPUTS, "outputs": OUTPUTS}),
+    "psi_high": (HighPerformanceModel, PsiHigh, {"maps": 1, "inputs": INPUTS, "outputs": OUTPUTS}),
+    "phi": (HeightChangeModel, HeightChange, {}),
+    "phi_vae": (PileStateModel, Phi, {}),
 }
 
 
 def kind_of(model: Model) -> str:
     """The name under which a model is saved."""
-    return "psi_low" if isinstance(model, PerformanceModel) else "psi_high"
+    return next(kind for kind, (made, _, _) in _KINDS.items() if isinstance(model, made))
 
 
 def architecture(network: Any) -> dict[str, Any]:
     """What a network has to be built with anew."""
-    kind = "psi_low" if isinstance(network, PsiLow) else "psi_high"
-    head = network if kind == "psi_low" else network.head
+    kind = next(name for name, (_, made, _) in _KINDS.items() if isinstance(network, made))
+    parts = {"psi_high": "head", "phi": "weights", "phi_vae": "step"}
+    perceptron = getattr(network, parts[kind]) if kind in parts else network
     record = {
-        "hidden": [layer.out_features for layer in head.hidden],
-        "activation": head.activation,
-        "dropout": head.dropout.rate,
+        "hidden": [layer.out_features for layer in perceptron.hidden],
+        "dropout": perceptron.dropout.rate,
     }
+    if kind != "phi_vae":
+        record["activation"] = perceptron.activation
     if kind == "psi_low":
-        return record | {"standardised": network.scale_in is not None}
-    return record | {"encoder": network.encoder_name}
+        record["standardised"] = network.scale_in is not None
+    if kind == "psi_high":
+        record["encoder"] = network.encoder_name
+    return record
 
 
 def _network(kind: str, record: Mapping[str, Any]) -> Any:
-    settings = dict(record)
-    hidden = tuple(settings.pop("hidden"))
-    if kind == "psi_high":
-        return PsiHigh(hidden, rngs=nnx.Rngs(0), **settings)
-    # Models of before the standardisation do not name it.
-    settings.setdefault("standardised", False)
-    return PsiLow(hidden, rngs=nnx.Rngs(0), **settings)
+    settings = {**record, "hidden": tuple(record["hidden"])}
+    if kind == "psi_low":
+        # Models of before the standardisation do not name it.
+        settings.setdefault("standardised", False)
+    return _KINDS[kind][1](rngs=nnx.Rngs(0), **settings)
 
 
 def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[str, Any]) -> None:
@@ -102,7 +108,7 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
                 "kind": kind,
                 "architecture": architecture(network),
                 "normaliser": {
-                    name: _normaliser_to_dict(getattr(model, name)) for name in _NORMALISERS[kind]
+                    name: _normaliser_to_dict(getattr(model, name)) for name in _KINDS[kind][2]
                 },
                 "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
                 "versions": versions(),
@@ -133,7 +139,7 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
 
     Args:
         directory: Where `save_model` wrote it.
-        kind: "psi_low" or "psi_high".
+        kind: "psi_low", "psi_high", "phi" (ours) or "phi_vae" (as in the paper).
 
     Raises:
         InputError: If it is missing, damaged, or of another format or kind.
@@ -147,7 +153,7 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
         graph, params = nnx.split(nnx.eval_shape(lambda: _network(kind, shape)))
         normalisers = {
             name: _normaliser_of_dict(description["normaliser"][name], size)
-            for name, size in _NORMALISERS[kind].items()
+            for name, size in _KINDS[kind][2].items()
         }
         # Checked before orbax reads them: it would report damage at length, or wait.
         if _digests(directory / _WEIGHTS) != description["files"]:
@@ -167,8 +173,7 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
         what = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{directory}: is damaged ({what}): copy or train it again.") from error
     nnx.replace_by_pure_dict(params, jax.tree.map(jnp.asarray, weights))
-    make = PerformanceModel if kind == "psi_low" else HighPerformanceModel
-    return make(params=params, graph=graph, **normalisers)
+    return _KINDS[kind][0](params=params, graph=graph, **normalisers)
 
 
 def read_description(
@@ -193,7 +198,7 @@ def read_description(
         raise InputError(
             f"{directory}: is not a model of wlplan: name a directory that `wlplan train` wrote."
         ) from error
-    kinds = tuple(_NORMALISERS) if kind is None else (kind,)
+    kinds = tuple(_KINDS) if kind is None else (kind,)
     if found != MODEL_FORMAT or got not in kinds:
         raise InputError(
             f"{directory}: is {got!r} of format {found!r}, not {' or '.join(map(repr, kinds))} of "
