@@ -9,15 +9,9 @@ import pytest
 from flax import nnx
 
 from wlplan.errors import InputError
+from wlplan.models.layers import ACTIVATIONS, soft_clamp
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.performance import (
-    ACTIVATIONS,
-    INPUTS,
-    OUTPUTS,
-    PerformanceModel,
-    PsiLow,
-    soft_clamp,
-)
+from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel, PsiLow
 
 LOW = np.array([0.2, 0.0, -0.3, -0.2, 0.0, 0.0, 0.0, 0.0], np.float32)
 HIGH = np.array([0.6, 1.5, 0.3, 0.4, 0.7, 5.0, 0.7, 5.0], np.float32)
@@ -60,7 +54,7 @@ def test_the_architectures_of_the_grid_search(hidden, activation):
         return PsiLow(hidden, activation=activation, rngs=nnx.Rngs(0))
 
     assert jax.eval_shape(lambda: build()(jnp.zeros((5, INPUTS)))).shape == (5, OUTPUTS)
-    sizes = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(nnx.eval_shape(build))))
+    sizes = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(nnx.eval_shape(build), nnx.Param)))
     widths = (INPUTS, *hidden, OUTPUTS)
     assert sizes == sum((n + 1) * m for n, m in itertools.pairwise(widths))
 

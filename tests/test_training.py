@@ -7,17 +7,21 @@ import shutil
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+from flax import nnx
 
-from wlplan import training
 from wlplan.dataset import VARIABLES, Dataset
 from wlplan.errors import InputError
+from wlplan.models.performance import PsiLow
 from wlplan.training import (
-    evaluate_psi_low,
+    evaluate_performance,
+    fitting,
     held_out,
     load_model,
     read_description,
     save_model,
+    storage,
     train_psi_low,
 )
 from wlplan.units import ACTION_HIGH
@@ -103,7 +107,7 @@ def test_training_reduces_the_loss(data, saved):
     description = read_description(saved[0])["training"]
     short, _ = train_psi_low(data, **{**LIGHT, "epochs": 1})
     whole = held_out(data, read_description(saved[0]))
-    first = evaluate_psi_low(short, whole).every.mean_absolute
+    first = evaluate_performance(short, whole).every.mean_absolute
     assert all(saved[2].every.mean_absolute[name] < 0.5 * first[name] for name in first)
     assert description["best_validation_loss"] <= description["last_validation_loss"]
     assert 1 <= description["best_epoch"] <= LIGHT["epochs"]
@@ -129,17 +133,27 @@ def test_the_same_seed_gives_the_same_weights_and_cycles_that_are_not_valid_play
 
 def test_the_validation_part_chooses_the_weights():
     """A learning rate that blows the network up late must not cost what was learnt before."""
-    x, y = jnp.zeros((64, 8)), jnp.zeros((64, 3))
-    graph, params = training.nnx.split(training.PsiLow((8,), rngs=training.nnx.Rngs(0)))
-    optimiser = training.optax.sgd(1e3)
-    loss = jnp.asarray(1e-9)
-    fit = training.Fit(params, optimiser.init(params), params, loss, jnp.asarray(7))
-    after, _ = training._epoch(
-        graph, optimiser, 32, fit, jax.random.key(0), jnp.asarray(8), (x + 1.0, y), (x + 1.0, y)
+    graph, params, rest = nnx.split(PsiLow((8,), rngs=nnx.Rngs(0)), nnx.Param, ...)
+    optimiser = optax.sgd(1e3)
+    fit = fitting.Fit(
+        params, rest, optimiser.init(params), (params, rest), jnp.asarray(1e-9), jnp.asarray(7)
+    )
+    examples = (jnp.ones((64, 8)), jnp.zeros((64, 3)))
+    after, _ = fitting._epoch(
+        graph,
+        lambda network, e, rngs: jnp.mean((network(e[0], rngs=rngs) - e[1]) ** 2),
+        optimiser,
+        32,
+        None,
+        fit,
+        jax.random.key(0),
+        jnp.asarray(8),
+        examples,
+        examples,
     )
     assert int(after.best_epoch) == 7
     assert float(after.best_loss) == pytest.approx(1e-9)
-    best, kept = jax.tree.leaves(after.best), jax.tree.leaves(params)
+    best, kept = jax.tree.leaves(after.best), jax.tree.leaves((params, rest))
     assert all(np.array_equal(a, b) for a, b in zip(best, kept, strict=True))
 
 
@@ -161,7 +175,7 @@ def test_the_errors_are_what_they_are_called(saved, data):
     p = jax.vmap(model)(jnp.asarray(data.characteristics), jnp.asarray(data.action))
     mass, time, work = (np.asarray(v) for v in (p.mass, p.time, p.work))
     truth = dataclasses.replace(data, mass=mass / 1.25, time=time - 1.0, work=work)
-    errors = evaluate_psi_low(model, truth).every
+    errors = evaluate_performance(model, truth).every
     assert errors.cycles == len(data)
     assert errors.mean_relative["mass"] == pytest.approx(0.25, rel=1e-4)
     assert errors.total_relative["mass"] == pytest.approx(0.25, rel=1e-4)
@@ -173,20 +187,20 @@ def test_empty_buckets_do_not_drown_the_relative_error(saved, data):
     _, model, _ = saved
     mass = data.mass.copy()
     mass[::10] = 0.0
-    some_empty = evaluate_psi_low(model, dataclasses.replace(data, mass=mass))
+    some_empty = evaluate_performance(model, dataclasses.replace(data, mass=mass))
     assert some_empty.loaded.mean_relative["mass"] < 0.05
     assert some_empty.every.mean_relative["mass"] > 10.0
     assert some_empty.loaded.cycles == np.sum(mass >= 0.5)
     json.dumps(some_empty.as_dict(), allow_nan=False)
     empty = dataclasses.replace(data, mass=np.zeros_like(mass))
-    refused(lambda: evaluate_psi_low(model, empty), "nothing to evaluate")
+    refused(lambda: evaluate_performance(model, empty), "nothing to evaluate")
 
 
 def test_only_the_test_part_of_the_training_data_is_held_out(saved, data):
     description = read_description(saved[0])
     part = held_out(data, description)
     assert len(part) == saved[2].every.cycles == description["training"]["cycles"][2]
-    assert evaluate_psi_low(saved[1], part).as_dict() == description["held_out"]
+    assert evaluate_performance(saved[1], part).as_dict() == description["held_out"]
     other = synthetic(seed=1)
     assert held_out(other, description) is other
 
@@ -255,7 +269,7 @@ def test_a_failed_save_leaves_the_old_model(copy, saved, monkeypatch):
     def fails(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(training, "_digests", fails)
+    monkeypatch.setattr(storage, "_digests", fails)
     refused(lambda: save_model(copy, saved[1], {}), "No space")
     assert contents(copy) == before
     assert [p.name for p in copy.parent.iterdir()] == ["copy"]

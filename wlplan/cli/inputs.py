@@ -82,7 +82,7 @@ def check_model(name: str | None, world: str) -> None:
     """
     if name is None:
         return
-    if world != "low":
+    if world not in ("low", "hybrid"):
         raise InputError(f"--model does not go with --world {world}: leave one of them out.")
     check_is_folder(name, "model", "wlplan train")
 
@@ -193,18 +193,18 @@ def world_named(name: str, site: Site, model: str | None = None) -> World:
     from wlplan.worlds import load_world
 
     world = load_world(name, model=model, soil=site.soil, machine=site.machine)
-    if name == "low":
-        _remark_on_training(model, site)
+    if name in ("low", "hybrid"):
+        _remark_on_training("psi_low" if name == "low" else "psi_high", model, site)
     return world
 
 
-def _remark_on_training(model: str | None, site: Site) -> None:
+def _remark_on_training(kind: str, model: str | None, site: Site) -> None:
     """Tell if a model was trained for another soil or machine than those of a site."""
     from wlplan.training import read_description
     from wlplan.worlds import pretrained_path
 
-    folder = pretrained_path("psi_low") if model is None else Path(model)
-    data = read_description(folder).get("dataset")
+    folder = pretrained_path(kind) if model is None else Path(model)
+    data = read_description(folder, kind).get("dataset")
     data = data if isinstance(data, dict) else {}
     trained = {part: data.get(part) for part in ("soil", "machine")}
     # A description may say nothing of them: data of one's own do not have to.

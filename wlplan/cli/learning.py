@@ -10,7 +10,14 @@ import click
 from click.core import ParameterSource
 
 from wlplan.cli.inputs import check_is_folder, check_model, site_named
-from wlplan.cli.options import ShardNumber, site_options, with_options
+from wlplan.cli.options import (
+    ACTIVATIONS,
+    ENCODERS,
+    LayerUnits,
+    ShardNumber,
+    site_options,
+    with_options,
+)
 from wlplan.cli.outputs import QUANTITIES, checked_folder, json_text, print_table, titled_table
 from wlplan.cli.progress import Progress, Stopwatch
 from wlplan.errors import InputError
@@ -112,40 +119,101 @@ def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
     print(f"{cycles} cycles of {len(parts)} {'shard' if len(parts) == 1 else 'shards'} in {out}")
 
 
+# Names of the models on the command line.
+_KINDS = ("psi-low", "psi-high", "phi", "phi-vae")
+
+
 @click.command()
-@click.argument("kind", metavar="MODEL", type=click.Choice(("psi-low",)))
+@click.argument("kind", metavar="MODEL", type=click.Choice(_KINDS))
 @with_options(
     click.option("--data", metavar="DATA.zarr", required=True, help="Data set to train on."),
     click.option("--out", metavar="DIR", required=True, help="Folder of the model."),
     click.option(
         "--epochs",
         type=click.IntRange(1, 100_000),
-        default=300,
-        show_default=True,
-        help="Passes over the data.",
+        default=None,
+        help="Passes over the data. Default: psi-low, psi-high 150, phi 100, phi-vae twice 40.",
+    ),
+    click.option(
+        "--activation",
+        type=click.Choice(ACTIVATIONS),
+        default=None,
+        help="Activation function. Default: swish; of phi-vae it is leaky_relu.",
+    ),
+    click.option(
+        "--hidden",
+        type=LayerUnits(),
+        default=None,
+        help="Units of each hidden layer. Default: 512,512; phi-vae 1024,1024.",
+    ),
+    click.option(
+        "--dropout",
+        type=click.FloatRange(0.0, 1.0, max_open=True),
+        default=None,
+        help="Part of the hidden units dropped. Default: psi-low 0.02, phi 0.05, others 0.1.",
+    ),
+    click.option(
+        "--encoder",
+        type=click.Choice(ENCODERS),
+        default=None,
+        help="psi-high: what tells it about the map, the paper's convolutions or (default) ours.",
     ),
 )
-def train(kind: str, data: str, out: str, epochs: int, seed: int, as_json: bool) -> None:
-    """Train MODEL (psi-low) on a data set and report its errors on cycles that it has not seen."""
+def train(
+    kind: str,
+    data: str,
+    out: str,
+    epochs: int | None,
+    activation: str | None,
+    hidden: tuple[int, ...] | None,
+    dropout: float | None,
+    encoder: str | None,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Train MODEL on a data set and report its errors on cycles that it has not seen.
+
+    MODEL is psi-low or psi-high, which predict the performance, phi, which predicts the pile state,
+    or phi-vae, which does so as in the paper.
+
+    Interrupted, the same command goes on where it stopped.
+    """
     check_is_folder(data, "data set", "wlplan collect")
     checked_folder(out)
+    if encoder is not None and kind != "psi-high":
+        raise InputError(f"--encoder does not go with {kind}: leave it out.")
+    if activation is not None and kind == "phi-vae":
+        raise InputError(f"--activation does not go with {kind}: leave it out.")
+    chosen = {
+        "epochs": epochs,
+        "activation": activation,
+        "hidden": hidden,
+        "dropout": dropout,
+        "encoder": encoder,
+    }
+    settings = {name: value for name, value in chosen.items() if value is not None}
 
+    from wlplan import training as trainers
     from wlplan.dataset import open_dataset
-    from wlplan.training import train_psi_low
 
     dataset = open_dataset(data)
+    trainer: Any = getattr(trainers, f"train_{kind.replace('-', '_')}")
     with Progress() as progress, Stopwatch() as training:
-        _, report = train_psi_low(
+        _, report = trainer(
             dataset,
             out=out,
             seed=seed,
-            epochs=epochs,
+            **settings,
             progress=lambda done, total: progress("epochs", done, total, None),
         )
     if as_json:
         click.echo(json_text({"model": kind, "out": out, "held_out": report.as_dict()}))
         return
-    _print_errors(f"{kind}, held-out part of {data}", report.as_dict())
+    title = f"{kind}, held-out part of {data}"
+    if kind.startswith("phi"):
+        _print_pile_state(title, [("", report.as_dict())])
+    else:
+        _print_errors(title, report.as_dict())
     print(f"training {training.text()}")
     print(f"written: {out}")
 
@@ -167,19 +235,63 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     check_model(model, "low")
 
     from wlplan.dataset import open_dataset
-    from wlplan.training import evaluate_psi_low, held_out, load_model, read_description
+    from wlplan.training import (
+        evaluate_performance,
+        evaluate_pile_state,
+        held_out,
+        load_model,
+        read_description,
+    )
     from wlplan.worlds import pretrained_path
 
     folder = pretrained_path("psi_low") if model is None else Path(model)
-    description, predictor = read_description(folder), load_model(folder)
+    description = read_description(folder, kind=None)
+    predictor: Any = load_model(folder, description["kind"])
+    kind = description["kind"].replace("_", "-")
     dataset = open_dataset(data)
     part = held_out(dataset, description)
-    report = evaluate_psi_low(predictor, part).as_dict()
-    if as_json:
-        click.echo(json_text({"model": "psi-low", "data": data, "errors": report}))
-        return
     which = "held-out part" if len(part) < len(dataset) else "all cycles"
-    _print_errors(f"psi-low, {which} of {data}", report)
+    title = f"{kind}, {which} of {data}"
+    if kind.startswith("phi"):
+        # Of the paper's predictor also without its post-processing.
+        ways = {"": True} if kind == "phi" else {"edges blended": True, "as predicted": False}
+        rows = [
+            (name, evaluate_pile_state(predictor, part, blend=blend).as_dict())
+            for name, blend in ways.items()
+        ]
+        if as_json:
+            errors = rows[0][1] | ({"without_blending": rows[1][1]} if len(rows) > 1 else {})
+            click.echo(json_text({"model": kind, "data": data, "errors": errors}))
+        else:
+            _print_pile_state(title, rows)
+        return
+    report = evaluate_performance(predictor, part).as_dict()
+    if as_json:
+        click.echo(json_text({"model": kind, "data": data, "errors": report}))
+        return
+    _print_errors(title, report)
+
+
+# Table 2 of the paper: mean absolute [m³] and mean relative error.
+_PAPER = (("paper, edges blended", 0.75, 0.0304), ("paper, as predicted", 0.84, 0.0341))
+
+
+def _print_pile_state(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
+    """Errors of a pile state predictor, beside the paper's on the paper's data."""
+    table = titled_table(title)
+    for column in ("", "cycles", "misplaced volume", "relative to the pile", "volume removed"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, errors in rows:
+        table.add_row(
+            name or "ours",
+            str(errors["cycles"]),
+            f"{errors['mean_absolute']:.3f} m³",
+            f"{100.0 * errors['mean_relative']:.2f} %",
+            f"{100.0 * errors['total_volume']:+.2f} %",
+        )
+    for name, absolute, relative in _PAPER:
+        table.add_row(name, "", f"{absolute:.2f} m³", f"{100.0 * relative:.2f} %", "")
+    print_table(table)
 
 
 def _print_errors(title: str, report: Mapping[str, Any]) -> None:

@@ -17,6 +17,8 @@ WORLDS = ("low", "high", "hybrid", "simulator")
 ENGINES = ("simulator", "dem")
 PLANNERS = ("gradient", "greedy", "nominal")
 OBJECTIVES = ("efficiency", "productivity", "energy")
+ACTIVATIONS = ("swish", "leaky_relu")
+ENCODERS = ("convolutional", "principal")
 
 BUNDLED = "bundled"
 """What stands for the pile that ships with the package where a file is asked for."""
@@ -73,6 +75,29 @@ class ActionNumbers(Numbers):
                     f"{name} is {number:g}, outside its range {low:g} to {high:g}", param, ctx
                 )
         return numbers
+
+
+class LayerUnits(click.ParamType):
+    """Units of each hidden layer of a network."""
+
+    name = "N[,N...]"
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """What stands for the value in the help."""
+        return self.name
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, ...]:
+        """The units of a text; numbers themselves are let pass, as click asks for."""
+        if isinstance(value, tuple):
+            return value
+        if not re.fullmatch("[0-9]{1,4}(,[0-9]{1,4}){0,7}", str(value)):
+            self.fail(f"{value!r} is not of the form {self.name}", param, ctx)
+        units = tuple(map(int, str(value).split(",")))
+        if not 1 <= min(units) <= max(units) <= 4096:
+            self.fail(f"{value!r} holds a layer that has not 1 to 4096 units", param, ctx)
+        return units
 
 
 class ShardNumber(click.ParamType):

@@ -1,0 +1,249 @@
+"""Laws of the pile state predictors: mass exact, never below ground, finite on flat ground."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from wlplan.automaton import relax
+from wlplan.dataset import VARIABLES, Dataset
+from wlplan.diggability import edge_poses
+from wlplan.errors import InputError
+from wlplan.machine import GRAVEL
+from wlplan.models.height_change import HeightChange, HeightChangeModel, Patterns, project
+from wlplan.models.normaliser import Normaliser
+from wlplan.models.performance_high import HighPerformanceModel, PsiHigh
+from wlplan.models.pile_state import (
+    Phi,
+    PileStateModel,
+    _gathered,
+    _scattered,
+    blended,
+    scaled,
+)
+from wlplan.pile import seed_pile, toe_contour
+from wlplan.training import evaluate_pile_state, load_model, train_phi, train_phi_vae
+from wlplan.types import LocalHeightmap, action_from
+from wlplan.worlds import HighWorld, load_world
+
+ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
+
+
+def slopes(count, seed=0):
+    """Maps of a slope that begins 1 m in, and the same with a dig of some size."""
+    random = np.random.default_rng(seed)
+    x = np.maximum(np.arange(52) * 0.1 - 1.0, 0.0)
+    steep = random.uniform(0.3, 0.7, count)
+    before = steep[:, None, None] * x[None, :, None] + random.normal(0.0, 0.01, (count, 52, 52))
+    deep = random.uniform(0.1, 0.3, count)
+    dig = np.zeros((52, 52))
+    dig[12:36, 13:39] = 1.0
+    after = before - np.minimum(deep[:, None, None] * dig, np.maximum(before, 0.0))
+    return before.astype(np.float32), after.astype(np.float32)
+
+
+def model_of(seed=0):
+    network = HeightChange((32,), rngs=nnx.Rngs(seed))
+    before, after = (jnp.asarray(v) for v in slopes(60))
+    random = np.random.default_rng(1)
+    known = jnp.asarray(random.uniform(0.0, 2.0, (60, 5)), jnp.float32)
+    network.fit_scales(before, after - before, known)
+    # Near the mean change: without training the weights are of another size.
+    kernel = network.weights.output.kernel
+    kernel[...] = 0.002 * kernel[...]
+    graph, params = nnx.split(network)
+    return HeightChangeModel(params, graph)
+
+
+def local(height):
+    return LocalHeightmap(jnp.asarray(height), 0.1, 1.0)
+
+
+# --- mass
+
+
+@pytest.mark.parametrize("volume", [0.0, 0.3, 1.7])
+def test_exactly_the_wanted_volume_leaves_and_nothing_goes_below_the_floor(volume):
+    random = np.random.default_rng(0)
+    change = jnp.asarray(random.normal(-0.1, 0.2, (52, 52)), jnp.float32)
+    above = jnp.asarray(slopes(1)[0][0].clip(0.0))
+    got = project(change, above, jnp.asarray(volume, jnp.float32))
+    assert -float(got.sum()) * 0.01 == pytest.approx(volume, abs=2e-5)
+    assert float((above + got).min()) >= -1e-6
+    assert (np.asarray(got)[np.asarray(change) > 0.0] >= 0.0).all()
+
+
+def test_where_too_little_is_there_all_of_it_leaves_and_nothing_appears():
+    above = jnp.full((52, 52), 0.01)
+    change = jnp.full((52, 52), -0.2).at[:10].set(0.1)
+    got = project(change, above, jnp.asarray(5.0))
+    assert float((above + got).min()) >= -1e-7
+    assert float(got.sum()) <= 1e-6
+
+
+def test_the_projection_passes_gradients_and_stays_finite_on_flat_ground():
+    change = jnp.asarray(np.random.default_rng(0).normal(-0.1, 0.1, (52, 52)), jnp.float32)
+    volume = jnp.asarray(1.0)
+    above = jnp.asarray(slopes(1)[0][0].clip(0.0))
+    assert float(jax.grad(lambda v: -project(change, above, v).sum() * 0.01)(volume)) == (
+        pytest.approx(1.0, rel=1e-4)
+    )
+    for ground in (above, jnp.zeros((52, 52))):
+        for wanted in (change, jnp.zeros((52, 52))):
+            slope = jax.grad(lambda *a: (project(*a) ** 2).sum(), (0, 1, 2))(wanted, ground, volume)
+            assert all(np.isfinite(s).all() for s in slope)
+
+
+# --- ours
+
+
+def test_patterns_give_back_what_they_were_made_from():
+    before, after = (jnp.asarray(v) for v in slopes(40))
+    patterns = Patterns(20)
+    patterns.fit(after - before)
+    again = patterns.maps(patterns.weights(after - before))
+    assert float(jnp.abs(again - (after - before)).mean()) < 1e-3
+    assert float(jnp.abs(after - before).mean()) > 1e-2
+
+
+def test_the_change_has_the_mass_and_a_finite_gradient():
+    model = model_of()
+
+    def after(height, action, volume):
+        ground = jnp.zeros((52, 52))
+        return height + model(local(height), action, volume, ground)
+
+    for height in (jnp.asarray(slopes(1)[0][0].clip(0.0)), jnp.zeros((52, 52))):
+        slope = jax.grad(lambda *a: (after(*a) ** 2).sum(), (0, 1, 2))(
+            height, ACTION, jnp.asarray(0.5)
+        )
+        assert all(np.isfinite(s).all() for s in slope)
+    steep = jnp.asarray(slopes(1)[0][0].clip(0.0))
+    left = (steep - after(steep, ACTION, jnp.asarray(0.5))).sum() * 0.01
+    assert float(left) == pytest.approx(0.5, abs=1e-4)
+    with pytest.raises(InputError, match="cells=52"):
+        model(local(jnp.zeros((36, 36))), ACTION, jnp.asarray(0.5), jnp.zeros((36, 36)))
+
+
+# --- the paper's
+
+
+def test_patches_come_back():
+    maps = jnp.arange(2.0 * 4 * 4 * 3).reshape(2, 4, 4, 3)
+    np.testing.assert_array_equal(_scattered(_gathered(maps)), maps)
+    np.testing.assert_array_equal(_gathered(maps)[0, 0, 0, :6], maps[0, 0, :2].ravel())
+
+
+def test_scaling_and_blending():
+    before, after = (jnp.asarray(v[0]) for v in slopes(1))
+    unit, low, span = scaled(before, jnp.zeros((52, 52)))
+    assert (float(unit.min()), float(unit.max())) == (0.0, 1.0)
+    np.testing.assert_allclose(low + span * unit, before, atol=1e-6)
+    mixed = blended(after, before)
+    np.testing.assert_array_equal(mixed[0], before[0])
+    np.testing.assert_array_equal(mixed[:, -1], before[:, -1])
+    np.testing.assert_allclose(mixed[10:-10, 10:-10], after[10:-10, 10:-10], atol=1e-6)
+
+
+def test_the_papers_model_is_finite_on_flat_ground():
+    graph, params = nnx.split(Phi((16,), rngs=nnx.Rngs(0)))
+    model = PileStateModel(params, graph)
+    for height in (jnp.zeros((52, 52)), jnp.asarray(slopes(1)[0][0])):
+        slope = jax.grad(lambda h, a: (model(local(h), a) ** 2).sum(), (0, 1))(height, ACTION)
+        assert all(np.isfinite(s).all() for s in slope)
+    assert float(jnp.abs(slope[1]).max()) > 0.0
+
+
+# --- training, worlds
+
+
+@pytest.fixture(scope="module")
+def data():
+    before, after = slopes(240)
+    n = len(before)
+    columns = {name: np.zeros((n, *v.shape), v.dtype) for name, v in VARIABLES.items()}
+    volume = (before - after).sum(axis=(1, 2)) * 0.01
+    columns |= {
+        "h52": before,
+        "h52_after": after,
+        "mass": (volume * 1.727).astype(np.float32),
+        "rollout": np.repeat(np.arange(24, dtype=np.int32), 10),
+        "valid": np.ones(n, bool),
+    }
+    return Dataset(**columns, attributes={"soil": {"density": 1727.0}})
+
+
+def test_training_learns_the_change_and_a_model_comes_back(data, tmp_path):
+    settings = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
+    model, errors = train_phi(data, out=tmp_path / "phi", epochs=30, **settings)
+    unchanged = np.abs(data.h52 - data.h52_after).sum(axis=(1, 2)).mean() * 0.01
+    assert errors.mean_absolute < 0.2 * unchanged
+    assert abs(errors.total_volume) < 1e-4
+    loaded = load_model(tmp_path / "phi", "phi")
+    for got, want in zip(jax.tree.leaves(loaded), jax.tree.leaves(model), strict=True):
+        np.testing.assert_array_equal(got, want)
+    assert [path.name for path in tmp_path.iterdir()] == ["phi"]
+
+
+def test_the_errors_are_those_of_the_papers_formulas(data):
+    model = model_of()
+    errors = evaluate_pile_state(model, data)
+    volume = jnp.asarray(data.mass / 1.727)
+    after = [
+        h + model(local(h), jnp.zeros(4), v, jnp.full((52, 52), h.min()))
+        for h, v in zip(jnp.asarray(data.h52[:20]), volume[:20], strict=True)
+    ]
+    wrong = np.abs(np.stack(after) - data.h52_after[:20]).sum(axis=(1, 2)) * 0.01
+    under = np.abs(data.h52_after[:20]).sum(axis=(1, 2)) * 0.01
+    few = evaluate_pile_state(model, data.select(np.arange(20)))
+    assert few.mean_absolute == pytest.approx(wrong.mean(), rel=1e-4)
+    assert few.mean_relative == pytest.approx((wrong / under).mean(), rel=1e-4)
+    assert errors.cycles == 240
+
+
+def test_both_stages_of_the_paper_are_trained(data, tmp_path):
+    done = []
+    _, errors = train_phi_vae(
+        data,
+        out=tmp_path / "vae",
+        epochs=2,
+        hidden=(16,),
+        progress=lambda *n: done.append(n),
+    )
+    assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert np.isfinite(errors.mean_absolute)
+    load_model(tmp_path / "vae", "phi_vae")
+    assert [path.name for path in tmp_path.iterdir()] == ["vae"]
+
+
+def test_the_high_world_removes_the_mass_that_it_reports():
+    psi = PsiHigh((16,), encoder="principal", rngs=nnx.Rngs(0))
+    # A load of about a tonne, and some that hangs on the inputs.
+    psi.head.output.bias[...] = jnp.full(3, 0.15)
+    psi.head.output.kernel[...] = 0.05 * psi.head.output.kernel[...]
+    graph, params = nnx.split(psi)
+    ranges = [np.array([[0.0], [2.5]]), np.stack([np.zeros(8), np.ones(8)])]
+    ranges += [np.array([[0.5, 6.0, 100.0], [4.0, 20.0, 900.0]])]
+    model = HighPerformanceModel(
+        params, *(Normaliser.of(r.astype(np.float32)) for r in ranges), graph
+    )
+    world = HighWorld(model, model_of())
+    pile = relax(seed_pile("conical", slope=np.radians(30.0), height=2.0))
+    pose = jax.tree.map(lambda leaf: leaf[0], edge_poses(toe_contour(pile), 1))
+    after, p = world(pile, pose, action_from(ACTION))
+    left = np.asarray(pile.height - after.height, np.float64).sum() * pile.cell_size**2
+    assert float(p.mass) > 0.1
+    assert left * GRAVEL.density / 1000.0 == pytest.approx(float(p.mass), rel=1e-4)
+    assert float(after.height.min()) >= float(pile.height.min()) - 1e-5
+
+    def cost(heading):
+        height, q = world(pile, pose.replace(heading=heading), action_from(ACTION))
+        return q.work / q.mass + height.height.mean()
+
+    assert np.isfinite(jax.grad(cost)(pose.heading))
+
+
+def test_a_world_without_weights_says_so():
+    with pytest.raises(InputError, match="psi_high"):
+        load_world("high")

@@ -1,0 +1,264 @@
+"""Fitting a network to examples: epochs of AdamW, the best weights kept, resumable."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import io
+import json
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from jaxtyping import Array
+
+from wlplan.errors import InputError
+from wlplan.io.files import write_bytes_atomic
+from wlplan.types import PyTree
+
+# Part of the steps over which the learning rate rises before its cosine decay. Our choice; the
+# paper uses Adam at a constant 1e-5 for up to 2,000 epochs.
+_WARM_UP = 0.05
+# Gradients of more than this norm are scaled down to it.
+_LARGEST_GRADIENT = 1.0
+# Examples of the validation part at a time, which bounds the memory.
+_CHUNK = 256
+# Least time between two saved states [s].
+_SAVE_EVERY = 30.0
+
+Loss = Callable[[Any, PyTree, nnx.Rngs | None], Array]
+"""Mean loss of a network over examples; without random streams, as in use and not in training."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """How long and how fast a network is fitted."""
+
+    epochs: int
+    batch: int  # examples a step; at most those there are
+    learning_rate: float  # at its peak
+    weight_decay: float = 1e-2
+    seed: int = 0  # of the order of the examples and the dropout
+
+    def __post_init__(self) -> None:
+        if self.epochs < 1 or self.batch < 1:
+            raise InputError(
+                f"{self.epochs} epochs of batches of {self.batch} asked for: both have to be at "
+                f"least 1."
+            )
+
+    def as_dict(self) -> dict[str, Any]:
+        """The recipe as `model.json` has it."""
+        return {"optimiser": "AdamW, cosine schedule", **dataclasses.asdict(self)}
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """What training carries from epoch to epoch."""
+
+    params: Any
+    rest: Any  # state of the network that is not trained, such as running norms
+    optimiser: Any
+    best: Any  # params and rest with the least validation loss so far
+    best_loss: Any
+    best_epoch: Any
+
+
+class SavedState:
+    """The state of an unfinished training, in one file beside the model to be.
+
+    A file of another training, with other data or settings, counts as none.
+
+    Args:
+        path: Where to keep it.
+        identity: All that the result follows from.
+    """
+
+    def __init__(self, path: Path, identity: Mapping[str, Any]):
+        text = json.dumps(identity, sort_keys=True, default=str)
+        self._path = path
+        self._identity = hashlib.sha256(text.encode()).hexdigest()
+        self._saved_at = time.monotonic()
+
+    def save(self, fit: Fit, done: int, losses: Array, *, now: bool = False) -> None:
+        """Saves the state after so many epochs, unless the last time was a moment ago."""
+        if not now and time.monotonic() - self._saved_at < _SAVE_EVERY:
+            return
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        leaves = {f"leaf{n}": np.asarray(leaf) for n, leaf in enumerate(jax.tree.leaves(fit))}
+        content = io.BytesIO()
+        np.savez(
+            content,
+            identity=np.array(self._identity),
+            done=np.array(done),
+            losses=np.asarray(losses),
+            **leaves,  # type: ignore[arg-type]
+        )
+        write_bytes_atomic(self._path, content.getvalue())
+        self._saved_at = time.monotonic()
+
+    def load(self, like: Fit) -> tuple[Fit, int, np.ndarray] | None:
+        """The state, the number of epochs done and their last losses; None: start anew."""
+        # Whatever is wrong with the file, the training can be done without it.
+        with contextlib.suppress(Exception), np.load(self._path, allow_pickle=False) as file:
+            if str(file["identity"]) == self._identity:
+                leaves, tree = jax.tree.flatten(like)
+                found = [jnp.asarray(file[f"leaf{n}"]) for n in range(len(leaves))]
+                return jax.tree.unflatten(tree, found), int(file["done"]), file["losses"]
+        return None
+
+    def remove(self) -> None:
+        """Forgets the state: the model is saved."""
+        self._path.unlink(missing_ok=True)
+
+
+def fitted(
+    network: nnx.Module,
+    loss: Loss,
+    train: PyTree,
+    validation: PyTree,
+    recipe: Recipe,
+    *,
+    augment: Callable[[Array, PyTree], PyTree] | None = None,
+    state: SavedState | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Any, dict[str, Any]]:
+    """Fits a network to examples.
+
+    Args:
+        network: Network to start from.
+        loss: Loss to reduce.
+        train: Examples, leaves with one leading axis.
+        validation: Examples that choose among the epochs.
+        recipe: How long and how fast.
+        augment: Changes the examples of a step at random.
+        state: Where an unfinished training is kept.
+        progress: Called with the number of epochs done and in all.
+
+    Returns:
+        The state of the network with the least validation loss, and a record of the training.
+
+    Raises:
+        InputError: If the training diverges.
+    """
+    graph, params, rest = _split(network)
+    count = len(jax.tree.leaves(train)[0])
+    batch = min(recipe.batch, count)
+    steps = recipe.epochs * (count // batch)
+    rate = optax.warmup_cosine_decay_schedule(
+        0.0, recipe.learning_rate, int(_WARM_UP * steps), max(steps, 1)
+    )
+    optimiser = optax.chain(
+        optax.clip_by_global_norm(_LARGEST_GRADIENT),
+        optax.adamw(rate, weight_decay=recipe.weight_decay),
+    )
+    run_epoch = jax.jit(partial(_epoch, graph, loss, optimiser, batch, augment))
+    infinite = jnp.asarray(jnp.inf, jax.tree.leaves(params)[0].dtype)
+    fit = Fit(params, rest, optimiser.init(params), (params, rest), infinite, jnp.asarray(0))
+    losses: Any = np.full(2, np.inf)
+    done = 0
+    if state is not None and (found := state.load(fit)) is not None:
+        fit, done, losses = found
+    while done < recipe.epochs:
+        key = jax.random.fold_in(jax.random.key(recipe.seed), done)
+        fit, losses = run_epoch(fit, key, jnp.asarray(done), train, validation)
+        done += 1
+        if state is not None:
+            state.save(fit, done, losses, now=done == recipe.epochs)
+        if progress is not None:
+            jax.block_until_ready(losses)
+            progress(done, recipe.epochs)
+    training_loss, validation_loss = (float(loss) for loss in losses)
+    if not np.isfinite(float(fit.best_loss)):
+        raise InputError("The training diverged: use a smaller learning rate.")
+    record = {
+        **recipe.as_dict(),
+        "batch": batch,
+        "best_epoch": int(fit.best_epoch) + 1,
+        "best_validation_loss": float(fit.best_loss),
+        "last_training_loss": training_loss,
+        "last_validation_loss": validation_loss,
+    }
+    return nnx.merge_state(*fit.best), record
+
+
+def _epoch(
+    graph: Any,
+    loss: Loss,
+    optimiser: optax.GradientTransformation,
+    batch: int,
+    augment: Callable[[Array, PyTree], PyTree] | None,
+    fit: Fit,
+    key: Array,
+    number: Array,
+    train: PyTree,
+    validation: PyTree,
+) -> tuple[Fit, Array]:
+    """One pass over the shuffled examples; the fit, and training and validation loss."""
+    order_key, step_key = jax.random.split(key)
+    count = len(jax.tree.leaves(train)[0])
+    steps = count // batch
+    # What does not fill a batch is left out, of each epoch another part.
+    order = jax.random.permutation(order_key, count)[: steps * batch].reshape(steps, batch)
+
+    def loss_of(params: Any, rest: Any, examples: PyTree, key: Array) -> tuple[Array, Any]:
+        # A copy: running norms may not be written to in the module that was traced outside.
+        network = nnx.merge(graph, params, rest, copy=True)
+        value = loss(network, examples, nnx.Rngs(key))
+        return value, _split(network)[2]
+
+    def step(carry: Any, inputs: tuple[Array, Array]) -> tuple[Any, Array]:
+        params, rest, state = carry
+        which, key = inputs
+        examples = jax.tree.map(lambda leaf: leaf[which], train)
+        augment_key, loss_key = jax.random.split(key)
+        if augment is not None:
+            examples = augment(augment_key, examples)
+        (value, rest), gradient = jax.value_and_grad(loss_of, has_aux=True)(
+            params, rest, examples, loss_key
+        )
+        updates, state = optimiser.update(gradient, state, params)
+        return (optax.apply_updates(params, updates), rest, state), value
+
+    (params, rest, state), losses = jax.lax.scan(
+        step, (fit.params, fit.rest, fit.optimiser), (order, jax.random.split(step_key, steps))
+    )
+    value = _mean_loss(nnx.merge(graph, params, rest), loss, validation)
+    better = value < fit.best_loss
+    best = jax.tree.map(partial(jnp.where, better), (params, rest), fit.best)
+    return (
+        Fit(
+            params,
+            rest,
+            state,
+            best,
+            jnp.where(better, value, fit.best_loss),
+            jnp.where(better, number, fit.best_epoch),
+        ),
+        jnp.stack([losses.mean(), value]),
+    )
+
+
+def _mean_loss(network: Any, loss: Loss, examples: PyTree) -> Array:
+    """The loss over many examples, a chunk at a time."""
+    count = len(jax.tree.leaves(examples)[0])
+    starts = range(0, count, _CHUNK)
+    parts = [jax.tree.map(lambda leaf, s=s: leaf[s : s + _CHUNK], examples) for s in starts]
+    sizes = [len(jax.tree.leaves(part)[0]) for part in parts]
+    values = [loss(network, part, None) for part in parts]
+    return jnp.asarray(sum(n * value for n, value in zip(sizes, values, strict=True)) / count)
+
+
+def _split(network: nnx.Module) -> tuple[Any, Any, Any]:
+    """Structure, trained weights, and the rest of the state."""
+    parts: tuple[Any, ...] = nnx.split(network, nnx.Param, ...)
+    return parts[0], parts[1], parts[2]

@@ -1,0 +1,361 @@
+"""Training and errors of the pile state predictors. Paper, sections 6.4.2 and 7.2."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float
+
+from wlplan.dataset import Dataset, fingerprint, split, versions
+from wlplan.errors import InputError
+from wlplan.heightmap import STATE_DISPLACEMENT
+from wlplan.models.height_change import HeightChange, HeightChangeModel
+from wlplan.models.pile_state import Phi, PileStateModel, scaled
+from wlplan.training.fitting import Recipe, SavedState, fitted
+from wlplan.training.storage import architecture, check_target, save_model
+from wlplan.types import LocalHeightmap, PyTree
+from wlplan.units import CELL_SIZE, KG_PER_TONNE
+
+# Training, validation and test. Paper, section 6.4.2.
+_FRACTIONS = (0.8, 0.1, 0.1)
+# Density where a data set does not name its soil [kg/m³]: gravel. Paper, table of the simulator.
+_DENSITY = 1727.0
+# Weight of the divergence beside the squared error. Paper, section 6.4.2. We read both as sums,
+# over cells and over the code: with the mean over 2,704 cells the code would tell nothing.
+_DIVERGENCE = 0.1
+# Cycles predicted at a time, which bounds the memory.
+_CHUNK = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class PileStateErrors:
+    """Errors of a predicted pile state over a number of cycles. Paper, equation 15."""
+
+    cycles: int
+    # Mean of the volume between predicted and simulated surface [m³].
+    mean_absolute: float
+    # Mean of that volume over the volume under the simulated surface [1].
+    mean_relative: float
+    # Predicted over loaded volume, less one, of the sums over all cycles [1].
+    total_volume: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """The errors as JSON has them."""
+        return dataclasses.asdict(self)
+
+
+def evaluate_pile_state(
+    model: HeightChangeModel | PileStateModel, dataset: Dataset, *, blend: bool = True
+) -> PileStateErrors:
+    """Compares a model with the simulated cycles of a data set, or of a part of one.
+
+    A model that asks for the load is given the simulated one, so that it answers for its own errors
+    alone. As floor it has the lowest cell of each map.
+
+    Args:
+        model: Pile state predictor.
+        dataset: Cycles; those that are not valid do not count.
+        blend: Whether the paper's predictor blends with the map before along the edges.
+
+    Raises:
+        InputError: If no cycle is valid.
+    """
+    dataset = dataset.select(dataset.valid)
+    if not len(dataset):
+        raise InputError("No cycle is valid: there is nothing to evaluate on.")
+    before, known = jnp.asarray(dataset.h52), jnp.asarray(_known(dataset))
+    predicted = np.asarray(_predict(model, before, known, blend), np.float64)
+    after = dataset.h52_after.astype(np.float64)
+    wrong = np.abs(predicted - after).sum(axis=(1, 2)) * CELL_SIZE**2
+    under = np.abs(after).sum(axis=(1, 2)) * CELL_SIZE**2
+    left = (dataset.h52.astype(np.float64) - predicted).sum() * CELL_SIZE**2
+    loaded = _known(dataset)[:, 4].astype(np.float64).sum()
+    return PileStateErrors(
+        len(dataset),
+        float(wrong.mean()),
+        float((wrong / np.maximum(under, 1e-9)).mean()),
+        float(left / max(loaded, 1e-9) - 1.0),
+    )
+
+
+def _predict(model: Any, before: Array, known: Array, blend: bool) -> Array:
+    @jax.jit
+    def run(model: Any, before: Array, known: Array) -> Array:
+        def one(cycle: tuple[Array, Array]) -> Array:
+            height, known = cycle
+            local = LocalHeightmap(height, CELL_SIZE, STATE_DISPLACEMENT)
+            if isinstance(model, PileStateModel):
+                return model(local, known[:4], blend=blend)
+            ground = jnp.full_like(height, height.min())
+            return height + model(local, known[:4], known[4], ground)
+
+        return jax.lax.map(one, (before, known), batch_size=_CHUNK)
+
+    return run(model, before, known)
+
+
+def train_phi(
+    dataset: Dataset,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    seed: int = 0,
+    epochs: int = 100,
+    batch: int = 128,
+    hidden: tuple[int, ...] = (512, 512),
+    activation: str = "swish",
+    dropout: float = 0.05,
+    learning_rate: float = 2e-3,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[HeightChangeModel, PileStateErrors]:
+    """Trains our pile state predictor on a data set and saves it.
+
+    Split, choice of the weights, mirrored maps and resuming are as for `train_psi_high`.
+
+    Args:
+        dataset: Loading cycles; those that are not valid are left out.
+        out: Directory to save to; an older model there is replaced. None: nothing is saved.
+        seed: Seed of everything random but the split.
+        epochs: Passes over the training part.
+        batch: Cycles a step.
+        hidden: Units of each hidden layer.
+        activation: "swish" or "leaky_relu".
+        dropout: Part of the hidden units that is dropped in training.
+        learning_rate: Peak learning rate.
+        progress: Called with the number of epochs done and in all.
+
+    Returns:
+        The model and its errors on the test part.
+
+    Raises:
+        InputError: If the data set is too small or not finite, if training diverges, or if the
+            model cannot be saved.
+    """
+    recipe = Recipe(epochs, batch, learning_rate, seed=seed)
+    parts = _parts(dataset, out)
+    network = HeightChange(hidden, activation=activation, dropout=dropout, rngs=nnx.Rngs(seed))
+    maps, changes = (
+        [jnp.asarray(v) for v in values]
+        for values in (
+            [part.h52 for part in parts[:2]],
+            [part.h52_after - part.h52 for part in parts[:2]],
+        )
+    )
+    known = [jnp.asarray(_known(part)) for part in parts[:2]]
+    network.fit_scales(maps[0], changes[0], known[0])
+    examples = [
+        {
+            "maps": h,
+            "known": k,
+            "weights": network.change.weights(c),
+            "mirrored": network.change.weights(c[:, :, ::-1]),
+        }
+        for h, c, k in zip(maps, changes, known, strict=True)
+    ]
+    # In units of the first component, which brings the loss to the order of one.
+    spread = float(examples[0]["weights"].std(axis=0).max()) or 1.0
+
+    def loss(network: Any, e: PyTree, rngs: nnx.Rngs | None) -> Array:
+        error = network(e["maps"], e["known"], rngs=rngs) - e["weights"]
+        return jnp.mean(jnp.sum((error / spread) ** 2, axis=-1))
+
+    def mirror_some(key: Array, e: PyTree) -> PyTree:
+        mirrored = jax.random.bernoulli(key, 0.5, (len(e["maps"]), 1, 1))
+        return {
+            **e,
+            "maps": jnp.where(mirrored, e["maps"][:, :, ::-1], e["maps"]),
+            "weights": jnp.where(mirrored[:, :, 0], e["mirrored"], e["weights"]),
+        }
+
+    state = _state(dataset, out, "fit", recipe, network)
+    best, record = fitted(
+        network,
+        loss,
+        examples[0],
+        examples[1],
+        recipe,
+        augment=mirror_some,
+        state=state,
+        progress=progress,
+    )
+    model = HeightChangeModel(best, nnx.graphdef(network))
+    errors = evaluate_pile_state(model, parts[2])
+    _save(dataset, out, model, {**record, "cycles": [len(p) for p in parts]}, errors, [state])
+    return model, errors
+
+
+def train_phi_vae(
+    dataset: Dataset,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    seed: int = 0,
+    epochs: int = 40,
+    batch: int = 128,
+    hidden: tuple[int, ...] = (1024, 1024),
+    dropout: float = 0.1,
+    learning_rate: float = 1e-3,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[PileStateModel, PileStateErrors]:
+    """Trains φ of the paper in its two stages: the autoencoder, then the step between codes.
+
+    Both stages have as many epochs, and mirrored maps. All else as for `train_phi`.
+
+    Returns:
+        The model and its errors on the test part, with edge blending.
+
+    Raises:
+        InputError: As for `train_phi`.
+    """
+    recipe = Recipe(epochs, batch, learning_rate, seed=seed)
+    parts = _parts(dataset, out)
+    phi = Phi(hidden, dropout=dropout, rngs=nnx.Rngs(seed))
+    mean = parts[0].h52.mean(axis=0)
+    phi.mean[...] = jnp.asarray((mean + mean[:, ::-1]) / 2.0)
+    pairs = [_scaled_pairs(part, phi.mean[...]) for part in parts[:2]]
+
+    def reconstruction(vae: Any, e: PyTree, rngs: nnx.Rngs | None) -> Array:
+        code, log_variance = vae.encode(e["maps"])
+        divergence = 0.5 * (jnp.exp(log_variance) + code**2 - 1.0 - log_variance).sum(axis=-1)
+        if rngs is not None:
+            code = code + jnp.exp(0.5 * log_variance) * jax.random.normal(rngs(), code.shape)
+        squared = ((vae.decode(code) - e["maps"]) ** 2).sum(axis=(1, 2))
+        return jnp.mean(squared + _DIVERGENCE * divergence)
+
+    def mirror_some(key: Array, e: PyTree) -> PyTree:
+        mirrored = jax.random.bernoulli(key, 0.5, (len(e["maps"]), 1, 1))
+        return {**e, "maps": jnp.where(mirrored, e["maps"][:, :, ::-1], e["maps"])}
+
+    def told(offset: int) -> Callable[[int, int], None] | None:
+        return None if progress is None else lambda done, _: progress(offset + done, 2 * epochs)
+
+    states = [_state(dataset, out, stage, recipe, phi) for stage in ("vae", "step")]
+    # Every map is scaled by its own range here.
+    own = [{"maps": jnp.concatenate([pair["before"], pair["after_own"]])} for pair in pairs]
+    best, first = fitted(
+        phi.vae,
+        reconstruction,
+        own[0],
+        own[1],
+        recipe,
+        augment=mirror_some,
+        state=states[0],
+        progress=told(0),
+    )
+    nnx.update(phi.vae, best)
+
+    encode = jax.jit(lambda maps: jax.lax.map(lambda m: phi.vae.encode(m)[0], maps, batch_size=128))
+    # Of each pair also the mirror image, half and half.
+    codes = []
+    for pair, part in zip(pairs, parts[:2], strict=True):
+        known = jnp.concatenate([jnp.asarray(part.action), pair["span"][:, None]], axis=1)
+        inputs, outputs = [], []
+        for side in (1, -1):
+            z, after = (encode(pair[name][:, :, ::side]) for name in ("before", "after"))
+            inputs.append(jnp.concatenate([z, known], axis=1))
+            outputs.append(after)
+        codes.append({"inputs": jnp.concatenate(inputs), "outputs": jnp.concatenate(outputs)})
+    assert phi.step.scale_in is not None
+    assert phi.step.scale_out is not None
+    phi.step.scale_in.fit(codes[0]["inputs"])
+    phi.step.scale_out.fit(codes[0]["outputs"])
+    best, second = fitted(
+        phi.step,
+        lambda step, e, rngs: jnp.mean((step(e["inputs"], rngs=rngs) - e["outputs"]) ** 2),
+        codes[0],
+        codes[1],
+        recipe,
+        state=states[1],
+        progress=told(epochs),
+    )
+    nnx.update(phi.step, best)
+    graph, params = nnx.split(phi)
+    model = PileStateModel(params, graph)
+    errors = evaluate_pile_state(model, parts[2])
+    record = {"vae": first, "step": second, "cycles": [len(p) for p in parts]}
+    _save(dataset, out, model, record, errors, states)
+    return model, errors
+
+
+def _scaled_pairs(dataset: Dataset, mean: Array) -> dict[str, Array]:
+    """Scaled maps before and after; the latter by the scale of the former and by their own."""
+
+    @jax.jit
+    def pair(before: Array, after: Array) -> dict[str, Array]:
+        unit, low, span = scaled(before, mean)
+        return {
+            "before": unit,
+            "after": (after - mean - low) / span,
+            "after_own": scaled(after, mean)[0],
+            "span": span,
+        }
+
+    return jax.vmap(pair)(jnp.asarray(dataset.h52), jnp.asarray(dataset.h52_after))
+
+
+def _known(dataset: Dataset) -> Float[np.ndarray, "n 5"]:
+    """Action, and the volume of the load at the density of the soil [m³]."""
+    soil = dataset.attributes.get("soil")
+    density = soil.get("density", _DENSITY) if isinstance(soil, dict) else _DENSITY
+    volume = dataset.mass * np.float32(KG_PER_TONNE / density)
+    return np.concatenate([dataset.action, volume[:, None]], axis=1).astype(np.float32)
+
+
+def _parts(dataset: Dataset, out: str | os.PathLike[str] | None) -> list[Dataset]:
+    if out is not None:
+        check_target(Path(out))
+    parts = [part.select(part.valid) for part in split(dataset, fractions=_FRACTIONS)]
+    if not all(len(part) for part in parts):
+        raise InputError("The data set has too few valid cycles to split: collect more cycles.")
+    tables = [getattr(part, name) for part in parts for name in ("h52", "h52_after", "action")]
+    if not all(np.isfinite(table).all() for table in tables):
+        raise InputError("The data set holds numbers that are not finite: collect it again.")
+    return parts
+
+
+def _state(
+    dataset: Dataset,
+    out: str | os.PathLike[str] | None,
+    stage: str,
+    recipe: Recipe,
+    network: nnx.Module,
+) -> SavedState | None:
+    if out is None:
+        return None
+    place = Path(out).absolute()
+    identity = {
+        "dataset": fingerprint(dataset),
+        "recipe": recipe.as_dict(),
+        "network": type(network).__name__,
+        "architecture": architecture(network),
+        "stage": stage,
+        "versions": versions(),
+    }
+    return SavedState(place.with_name(f".{place.name}.{stage}.training.npz"), identity)
+
+
+def _save(
+    dataset: Dataset,
+    out: str | os.PathLike[str] | None,
+    model: HeightChangeModel | PileStateModel,
+    training: dict[str, Any],
+    errors: PileStateErrors,
+    states: list[SavedState | None],
+) -> None:
+    if out is None:
+        return
+    description = {
+        "training": {**training, "fractions": _FRACTIONS},
+        "dataset": {"fingerprint": fingerprint(dataset), **dataset.attributes},
+        "held_out": errors.as_dict(),
+    }
+    save_model(out, model, description)
+    for state in states:
+        if state is not None:
+            state.remove()
