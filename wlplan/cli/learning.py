@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -77,21 +78,46 @@ def collect(
     from wlplan.dataset import collect as collect_cycles
     from wlplan.simulator import Simulator
 
-    with Progress() as progress, Stopwatch() as playing:
+    begin = time.perf_counter()
+    counts: list[tuple[int, float]] = []
+    with Progress() as progress:
+
+        def tell(done: int, total: int) -> None:
+            counts.append((done, time.perf_counter() - begin))
+            progress("cycles", done, total, None)
+
         collect_cycles(
             out,
             cycles=cycles,
             seed=seed,
             simulator=Simulator(machine=site.machine, soil=site.soil),
             shard=shard,
-            progress=lambda done, total: progress("cycles", done, total, None),
+            progress=tell,
         )
     if as_json:
         part = {} if shard is None else {"shard": shard[0], "shards": shard[1]}
         click.echo(json_text({"out": out, "cycles": cycles, "seed": seed, **part}))
         return
     which = "" if shard is None else f"shard {shard[0]}/{shard[1]} of "
-    print(f"{which}{cycles} cycles in {out}; {playing.text()}")
+    print(f"{which}{cycles} cycles in {out}; {_pace(counts)}")
+
+
+def _pace(counts: Sequence[tuple[int, float]]) -> str:
+    """Time of a collection, its start apart: each process compiles before its first cycle ends.
+
+    Args:
+        counts: How many cycles there were, and when [s]; the first as it begins.
+    """
+    (there, _), (done, seconds) = counts[0], counts[-1]
+    played = [(count, at) for count, at in counts if count > there]
+    if not played:
+        return "nothing was left to play"
+    first, ready = played[0]
+    rate = (done - first) / (seconds - ready) if seconds > ready else float("nan")
+    return (
+        f"{seconds:.1f} s, {ready:.1f} of them until the first cycle (start and compiling), "
+        f"then {rate:.0f} cycles a second"
+    )
 
 
 def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
