@@ -7,6 +7,7 @@ import contextlib
 import inspect
 import json
 import platform
+import re
 import sys
 from collections.abc import Callable
 from importlib import metadata
@@ -48,7 +49,13 @@ def write(name: str, preset: str, result: dict[str, Any], folder: Path) -> Path:
         **result,
     }
     path = folder / f"{name}.json"
-    write_text_atomic(path, json.dumps(document, indent=1) + "\n")
+    # Lists of numbers in one line each: a result can be read, and compared with the one before.
+    text = re.sub(
+        r"\[\s+([^][{}]*?)\s+\]",
+        lambda found: "[" + re.sub(r"\s+", " ", found[1]) + "]",
+        json.dumps(document, indent=1),
+    )
+    write_text_atomic(path, text + "\n")
     return path
 
 
