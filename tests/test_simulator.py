@@ -437,6 +437,17 @@ def test_a_level_floor_rests_on_the_soil_it_has_cut():
         assert float(hard.vertical[0]) == pytest.approx(float(unborne.vertical[0]), abs=1e-6)
 
 
+def test_soil_behind_the_map_bears_nothing():
+    """The bucket's back reaches over the near edge of the map: cells there count once, not more."""
+    with jax.enable_x64(True):
+        spill = np.where(ALONG < -0.95, 0.1, 0.0)[:, None] * np.ones(52)
+        flat = np.zeros((52, 52))
+        got, none = (met_by(h, x=-0.2, z=0.0) for h in (spill, flat))
+        one_cell = GRAVEL.intrusion_stiffness * 0.1 * WA320.bucket_width * 0.1
+        lift = float(none.vertical[0] - got.vertical[0])
+        assert 0.5 * one_cell < lift < 1.1 * one_cell
+
+
 def test_a_tilted_floor_sinks_in_and_a_steep_path_frees_it():
     with jax.enable_x64(True):
         level = 0.5 * np.ones((52, 52))

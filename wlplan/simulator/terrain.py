@@ -159,9 +159,9 @@ def reaction(
 ) -> Reaction:
     """Resistance that the soil would put up against the bucket moving forward.
 
-    It is the sum of four: the edge and the open part of the floor cut, lane by lane; the content is
-    pushed against the pile ahead and carries soil on top and at its back with it; it rubs on the
-    floor, and with it the side plates; and what lies under the floor bears it.
+    The edge and the bare part of the floor cut, lane by lane. The content is pushed against the pile
+    ahead, rubs on the floor, and carries soil on top and at its back with it. And what lies under
+    the floor bears it.
 
     Args:
         machine: Machine parameters.
@@ -234,6 +234,7 @@ def _bearing(
     count = math.ceil(machine.bucket_depth / CELL_SIZE)
     last = jnp.floor((bucket.x - _ALONG[0]) / CELL_SIZE - 0.5).astype(jnp.int32)
     rows = last[None] - jnp.arange(count, dtype=jnp.int32)[:, None]
+    on_map = rows >= 0
     rows = jnp.clip(rows, 0, STATE_CELLS - 1)
     behind = bucket.x[None] - jnp.asarray(_ALONG, height.dtype)[rows]
     length = machine.bucket_depth * jnp.cos(bucket.tilt)[None]
@@ -241,6 +242,7 @@ def _bearing(
     under = jnp.clip(behind / CELL_SIZE - 0.5, 0.0, 1.0) * jnp.clip(
         (length - behind) / CELL_SIZE + 0.5, 0.0, 1.0
     )
+    under = jnp.where(on_map, under, 0.0)
     floor = bucket.z[None] - behind * jnp.tan(bucket.tilt)[None] - machine.plate_thickness
     surface = jnp.take_along_axis(height, rows[:, None], axis=0)
     lowest = jnp.take_along_axis(ground, rows[:, None], axis=0)
