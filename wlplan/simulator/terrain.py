@@ -159,9 +159,9 @@ def reaction(
 ) -> Reaction:
     """Resistance that the soil would put up against the bucket moving forward.
 
-    The edge and the bare part of the floor cut, lane by lane. The content is pushed against the pile
-    ahead, rubs on the floor, and carries soil on top and at its back with it. And what lies under
-    the floor bears it.
+    The edge and the bare part of the floor cut, lane by lane. The content is pushed against the
+    pile ahead, rubs on the floor, and carries soil on top and at its back with it. And what lies
+    under the floor bears it.
 
     Args:
         machine: Machine parameters.
