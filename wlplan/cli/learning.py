@@ -108,11 +108,10 @@ def _pace(counts: Sequence[tuple[int, float]]) -> str:
     Args:
         counts: How many cycles there were, and when [s]; the first as it begins.
     """
-    (there, _), (done, seconds) = counts[0], counts[-1]
-    played = [(count, at) for count, at in counts if count > there]
+    played = [(count, at) for count, at in counts if count > counts[0][0]]
     if not played:
         return "nothing was left to play"
-    first, ready = played[0]
+    (first, ready), (done, seconds) = played[0], played[-1]
     rate = (done - first) / (seconds - ready) if seconds > ready else float("nan")
     return (
         f"{seconds:.1f} s, {ready:.1f} of them until the first cycle (start and compiling), "
