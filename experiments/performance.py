@@ -21,7 +21,7 @@ from wlplan.plots import png_bytes
 from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.training import train_psi_high, train_psi_low
 
-SEEDS = 5
+SEEDS = 3
 MODELS = {
     "psi_low, swish": (train_psi_low, {"activation": "swish"}),
     "psi_low, leaky relu": (train_psi_low, {"activation": "leaky_relu"}),
