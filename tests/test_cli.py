@@ -630,6 +630,22 @@ def test_the_report_stands_alone_and_escapes_names(run, tmp_path):
     assert "<script" not in page
 
 
+def test_progress_tells_rate_and_remaining_time(capsys, monkeypatch):
+    clock = iter([0.0, 30.0, 41.0, 60.0, 71.0])
+    monkeypatch.setattr(cli.progress.time, "monotonic", lambda: next(clock))
+    with cli.progress.Progress() as progress:
+        # 100 were there; the first 10 took 30 s, compiling included, and do not count.
+        for done in (100, 110, 132, 170, 192):
+            progress("cycles", done, 1000, None)
+    assert capsys.readouterr().err.splitlines() == [
+        "cycles 100/1000",
+        "cycles 110/1000",
+        "cycles 132/1000, 2 a second, 7 min 14 s left",
+        "cycles 170/1000, 2 a second, 6 min 55 s left",
+        "cycles 192/1000, 2 a second, 6 min 44 s left",
+    ]
+
+
 def test_compiling_inside_of_tracing_counts_once(monkeypatch):
     watch = cli.progress.Stopwatch()
     with watch:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,10 @@ class Progress:
         self._bars: Any = None
         self._tasks: dict[str, TaskID] = {}
         self._told: dict[str, float] = {}
+        # Of each stage how much was done, and when, as it went on for the first time. What comes
+        # before is compiling, or was there from an earlier run.
+        self._begun: dict[str, int] = {}
+        self._moving: dict[str, tuple[int, float]] = {}
 
     def __enter__(self) -> Progress:
         if sys.stderr.isatty():
@@ -31,6 +36,7 @@ class Progress:
                 progress.BarColumn(),
                 progress.MofNCompleteColumn(),
                 progress.TimeElapsedColumn(),
+                progress.TextColumn("{task.fields[pace]}"),
                 progress.TextColumn("{task.fields[cost]}"),
                 console=Console(stderr=True),
                 transient=True,
@@ -45,16 +51,31 @@ class Progress:
     def __call__(self, stage: str, done: int, total: int, cost: float | None) -> None:
         """Tell how far a stage is, and the cost reached if there is one."""
         text = "" if cost is None else f"cost {cost:.3f}"
-        if self._bars is not None:
-            if stage not in self._tasks:
-                self._tasks[stage] = self._bars.add_task(stage, total=total, cost=text)
-            self._bars.update(self._tasks[stage], completed=done, total=total, cost=text)
-            return
         now = time.monotonic()
+        pace = self._pace(stage, done, total, now)
+        if self._bars is not None:
+            fields = {"cost": text, "pace": pace}
+            if stage not in self._tasks:
+                self._tasks[stage] = self._bars.add_task(stage, total=total, **fields)
+            self._bars.update(self._tasks[stage], completed=done, total=total, **fields)
+            return
         if stage in self._told and done < total and now - self._told[stage] < _PAUSE:
             return
         self._told[stage] = now
-        print(f"{stage} {done}/{total} {text}".rstrip(), file=sys.stderr, flush=True)
+        line = ", ".join(filter(None, (f"{stage} {done}/{total}", text, pace)))
+        print(line, file=sys.stderr, flush=True)
+
+    def _pace(self, stage: str, done: int, total: int, now: float) -> str:
+        """How many a second, and how long it will still take; nothing while that is not known."""
+        if done <= self._begun.setdefault(stage, done):
+            return ""
+        first, since = self._moving.setdefault(stage, (done, now))
+        if done <= first or now <= since:
+            return ""
+        rate = (done - first) / (now - since)
+        left = math.ceil((total - done) / rate)
+        wait = f"{left // 60} min {left % 60:02d} s" if left >= 60 else f"{left} s"
+        return f"{rate:.3g} a second, {wait} left"
 
 
 # Begin and end of everything that JAX has traced and compiled so far [s], of `time.perf_counter`.
