@@ -98,9 +98,10 @@ class Lanes:
     def beside(self, values: Float[Array, "2 b"]) -> Float[Array, "1 m b"]:
         """One value a side as one a column of a heightfield with a rim, just beside the bucket."""
         # A bucket as wide as the map has no column beside it: what falls stays in its own.
-        right, left = max(self.first, 1), min(self.end + 1, STATE_CELLS)
-        columns = jnp.zeros((1, STATE_CELLS + 2, values.shape[1]), values.dtype)
-        return columns.at[0, right].set(values[0]).at[0, left].set(values[1])
+        right, left = max(self.first - 1, 0), min(self.end, STATE_CELLS - 1)
+        columns = jnp.zeros((1, STATE_CELLS, values.shape[1]), values.dtype)
+        columns = columns.at[0, right].set(values[0]).at[0, left].set(values[1])
+        return jnp.pad(columns, ((0, 0), (1, 1), (0, 0)), mode="edge")
 
 
 def rimmed(field: Float[Array, "n m b"]) -> Float[Array, "i j b"]:
@@ -357,11 +358,12 @@ def move(
 
 
 def _aside(lanes: Lanes) -> np.ndarray:
-    """What of the soil pushed out of a lane is laid down in each column, the rim at zero."""
+    """What of the soil pushed out of a lane is laid down in each column, with the rim."""
     column = np.arange(STATE_CELLS)[:, None]
     lane = np.arange(lanes.first, lanes.end)[None]
     reach = np.maximum(1.0 - np.abs(column - lane) * CELL_SIZE / _PUSH_WIDTH, 0.0)
-    return np.pad(reach / reach.sum(axis=0), ((1, 1), (0, 0)))
+    # Were the rim not raised with the border, soil would slide off the map.
+    return np.pad(reach / reach.sum(axis=0), ((1, 1), (0, 0)), mode="edge")
 
 
 def _shifted(field: Array, i: int, j: int) -> Array:
