@@ -29,6 +29,7 @@ from wlplan.dataset import (
     Dataset,
     batches,
     collect,
+    collecting,
     crew,
     fingerprint,
     merge,
@@ -62,7 +63,7 @@ LONGER = 17
 def _short_rollouts():
     """Rollouts of 3 loadings, two a batch: 11 cycles make two batches."""
     with pytest.MonkeyPatch.context() as patch:
-        for part in (protocol, batches, stored):
+        for part in (protocol, batches, collecting, stored):
             patch.setattr(part, "LOADS", 3)
         patch.setattr(protocol, "_BATCH", 2)
         yield
@@ -279,6 +280,31 @@ def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike():
     headings = np.concatenate([Rollout(n, 0, 3, Simulator()).turn for n in range(60)])
     assert np.abs(headings).max() <= math.radians(10.0)
     assert headings.std() == pytest.approx(math.radians(20.0) / math.sqrt(12.0), rel=0.1)
+
+
+def test_a_corridor_is_dug_on_where_it_was_dug_before(worker):
+    def nearest(protocol):
+        """Median distance of a loading from the nearest before it."""
+        finished = []
+        session, numbers = crew.Session(Simulator(), SEED, 12, 12, protocol), iter([0, 1])
+        worker.play(session, lambda: next(numbers, None), finished.append)
+        rollouts = sorted(played for played in finished if played is not None)
+        poses = [played.records["pose"][:, :2] for played in rollouts]
+        distances = [
+            np.linalg.norm(pose[:k] - pose[k], axis=1).min() for pose in poses for k in range(1, 12)
+        ]
+        return np.median(distances), poses
+
+    (close, dug), (far, paper) = nearest("corridor"), nearest("paper")
+    assert close < 0.5 * far
+    # Piles, first places and actions are the same.
+    for one, other in zip(dug, paper, strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+
+
+def test_a_protocol_is_part_of_what_a_data_set_is(copy):
+    refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="corridor"), "protocol")
+    refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="other"), "paper, corridor")
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30, 31, 47, 449, 451, 1801, 10_718, 10_800])
@@ -769,8 +795,8 @@ def test_the_command_line_collects_shards_and_merges_them(shards, longer, tmp_pa
 CHILD = """
 import sys
 from wlplan import cli
-from wlplan.dataset import batches, protocol, store
-for part in (protocol, batches, store):
+from wlplan.dataset import batches, collecting, protocol, store
+for part in (protocol, batches, collecting, store):
     part.LOADS = 3
 protocol._BATCH = 2
 sys.exit(cli.main(["collect", *sys.argv[1:]]))

@@ -14,6 +14,7 @@ from wlplan.cli.inputs import check_is_folder, check_model, site_named
 from wlplan.cli.options import (
     ACTIVATIONS,
     ENCODERS,
+    PROTOCOLS,
     LayerUnits,
     ShardNumber,
     site_options,
@@ -46,6 +47,13 @@ _MOST_CYCLES = 1_000_000
     click.option(
         "--merge", "merging", is_flag=True, help="Join all shards PART.zarr instead of playing."
     ),
+    click.option(
+        "--protocol",
+        type=click.Choice(PROTOCOLS),
+        default="paper",
+        show_default=True,
+        help="Dig anywhere along the toe, as the paper does, or on where was dug before.",
+    ),
     *site_options(),
     click.argument("parts", metavar="[--merge PART.zarr...]", nargs=-1),
 )
@@ -54,6 +62,7 @@ def collect(
     out: str,
     shard: tuple[int, int] | None,
     merging: bool,
+    protocol: str,
     soil: str | None,
     machine: str | None,
     parts: tuple[str, ...],
@@ -90,6 +99,7 @@ def collect(
             out,
             cycles=cycles,
             seed=seed,
+            protocol=protocol,
             simulator=Simulator(machine=site.machine, soil=site.soil),
             shard=shard,
             progress=tell,
@@ -122,7 +132,7 @@ def _pace(counts: Sequence[tuple[int, float]]) -> str:
 def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
     """`collect --merge`: the shards say which cycles and seed they are of."""
     context = click.get_current_context()
-    for name in ("shard", "cycles", "seed", "soil", "machine"):
+    for name in ("shard", "cycles", "seed", "protocol", "soil", "machine"):
         if context.get_parameter_source(name) is not ParameterSource.DEFAULT:
             raise InputError(f"--{name} does not go with --merge: leave one of them out.")
     if not parts:

@@ -19,6 +19,7 @@ PLANNERS = ("gradient", "greedy", "nominal")
 OBJECTIVES = ("efficiency", "productivity", "energy")
 ACTIVATIONS = ("swish", "leaky_relu")
 ENCODERS = ("convolutional", "principal")
+PROTOCOLS = ("paper", "corridor")
 
 BUNDLED = "bundled"
 """What stands for the pile that ships with the package where a file is asked for."""

@@ -14,19 +14,16 @@ from wlplan.compilation import cores
 from wlplan.dataset.crew import Played, Session, Worker, hired
 from wlplan.dataset.protocol import Layout
 from wlplan.dataset.variables import LOADS, VARIABLES
-from wlplan.simulator import Simulator
 
 
 def batches_of(
     layout: Layout,
     start: int,
-    seed: int,
-    simulator: Simulator,
+    session: Session,
     progress: Callable[[int, int], None] | None,
 ) -> Generator[dict[str, np.ndarray]]:
     """The variables of one batch of cycles after the other, from cycle `start` of the whole on."""
     numbers = range(start // LOADS, math.ceil(layout.stop / LOADS))
-    session = Session(simulator, seed, layout.loads, LOADS)
     waiting, finished = iter(numbers), queue.SimpleQueue[Any]()
     lock, stopped = threading.Lock(), threading.Event()
 

@@ -10,7 +10,9 @@ from pathlib import Path
 
 from wlplan.dataset import store
 from wlplan.dataset.batches import batches_of
-from wlplan.dataset.protocol import Layout
+from wlplan.dataset.crew import Session
+from wlplan.dataset.protocol import PROTOCOLS, Layout
+from wlplan.dataset.variables import LOADS
 from wlplan.errors import InputError
 from wlplan.simulator import Simulator
 
@@ -22,6 +24,7 @@ def collect(
     *,
     cycles: int,
     seed: int = 0,
+    protocol: str = "paper",
     shard: tuple[int, int] | None = None,
     simulator: Simulator = _SIMULATOR,
     progress: Callable[[int, int], None] | None = None,
@@ -40,6 +43,7 @@ def collect(
         cycles: Number of loading cycles, of all shards together; the last rollout is cut short to
             meet it.
         seed: Seed of piles, poses and actions.
+        protocol: Where is dug, one of `PROTOCOLS`.
         shard: Which part to collect, counted from 1, and how many there are; None: everything.
         simulator: The simulator with its machine and soil.
         progress: Called with the number of cycles played so far and in all, of the shard if it is
@@ -47,27 +51,28 @@ def collect(
 
     Raises:
         InputError: If there is no such shard, or it would be empty; if the path holds something
-            else or a data set of another seed, number of cycles, shard or simulator; if another
-            process writes it; or if it cannot be written.
+            else or a data set of another seed, protocol, number of cycles, shard or simulator; if
+            another process writes it; or if it cannot be written.
     """
     path = Path(path)
     layout = Layout(cycles, shard)
     if seed < 0:
         raise InputError(f"The seed is {seed}: it has to be 0 or more.")
+    if protocol not in PROTOCOLS:
+        raise InputError(f"Unknown protocol {protocol!r}: choose one of {', '.join(PROTOCOLS)}.")
     done = 0
     try:
         path.parent.mkdir(parents=True, exist_ok=True)  # the lock goes there
         with store.lock(path):
-            wanted = store.identity(layout, seed, simulator)
+            wanted = store.identity(layout, seed, protocol, simulator)
             if store.is_new(path):
                 store.create(path, layout, wanted)
             done = store.resume(path, wanted)
             if progress is not None:
                 progress(done, layout.size)
             start = layout.first + done
-            with contextlib.closing(
-                batches_of(layout, start, seed, simulator, progress)
-            ) as batches:
+            session = Session(simulator, seed, layout.loads, LOADS, protocol)
+            with contextlib.closing(batches_of(layout, start, session, progress)) as batches:
                 for batch in batches:
                     store.write(path, batch, done)
                     done += len(batch["mass"])

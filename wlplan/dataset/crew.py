@@ -45,18 +45,20 @@ class Session:
         seed: Seed of piles, poses and actions.
         loads: Loadings to play of each rollout.
         length: Loadings of a whole rollout.
+        protocol: Where is dug, see `wlplan.dataset.protocol`.
     """
 
     simulator: Simulator
     seed: int
     loads: int
     length: int
+    protocol: str = "paper"
 
     def message(self) -> dict[str, Any]:
         """As JSON holds it."""
         parts = ("machine", "soil", "settings", "schedule")
         simulator = {name: dataclasses.asdict(getattr(self.simulator, name)) for name in parts}
-        rest = {"seed": self.seed, "loads": self.loads, "length": self.length}
+        rest = {name: getattr(self, name) for name in ("seed", "loads", "length", "protocol")}
         return {"simulator": simulator, **rest}
 
 

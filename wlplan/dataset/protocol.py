@@ -1,4 +1,4 @@
-"""The paper's protocol: which piles are dug where, with which actions, and what is recorded."""
+"""Protocols: which piles are dug where, with which actions, and what is recorded."""
 
 from __future__ import annotations
 
@@ -27,7 +27,14 @@ _BATCH = 60
 # Largest deviation of the heading from the normal of the toe [rad]. Paper, section 6.2.
 _HEADING_SPREAD = math.radians(10.0)
 # What the random streams are for; part of their keys.
-_ROLLOUT_STREAM, _ACTION_STREAM = 0, 1
+_ROLLOUT_STREAM, _ACTION_STREAM, _CORRIDOR_STREAM = 0, 1, 2
+# A corridor: part of the loadings that stay near the one before, and how near they stay, the
+# standard deviation of either coordinate [m].
+_STAY, _NEAR = 0.85, 0.5
+
+PROTOCOLS = ("paper", "corridor")
+"""Where a rollout digs: anywhere along the toe, as in the paper's section 6.2, or on where it dug
+before, as plans do: so corridors come about, and what stands between them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,6 +113,7 @@ class Rollout:
         loads: Loadings to play.
         simulator: The simulator.
         length: Loadings of a whole rollout; None: `LOADS`.
+        protocol: One of `PROTOCOLS`.
     """
 
     def __init__(
@@ -116,6 +124,7 @@ class Rollout:
         simulator: Simulator,
         *,
         length: int | None = None,
+        protocol: str = "paper",
     ):
         length = LOADS if length is None else length
         self.number = number
@@ -125,6 +134,14 @@ class Rollout:
         self.noise_seed = int(random.integers(2**31))
         self.place, turn = random.random((2, length))  # [0, 1) along the accessible toe
         self.turn = _HEADING_SPREAD * (2.0 * turn - 1.0)
+        # Of every loading, how far from the one before it is looked for [m]; NaN: anywhere.
+        self.shift = np.full((length, 2), np.nan)
+        if protocol == "corridor":
+            key = np.random.SeedSequence(seed, spawn_key=(_CORRIDOR_STREAM, number))
+            random = np.random.default_rng(key)
+            stays = random.random(length) < _STAY
+            stays[0] = False
+            self.shift = np.where(stays[:, None], random.normal(0.0, _NEAR, (length, 2)), np.nan)
         key = np.random.SeedSequence(seed, spawn_key=(_ACTION_STREAM, repeat))
         unit = latin_hypercube(len(SEED_PILES) * length, 4, np.random.default_rng(key))
         low, high = np.array(ACTION_LOW), np.array(ACTION_HIGH)
@@ -152,7 +169,9 @@ class Rollout:
     def prepare(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose and action of the next loading."""
         pile = Pile(self.height, CELL_SIZE, self.origin)
-        pose = choose_pose(pile, self.place[self.load], self.turn[self.load])
+        shift = self.shift[self.load]
+        near = None if np.isnan(shift).any() else self.pose[:2] + shift
+        pose = choose_pose(pile, self.place[self.load], self.turn[self.load], near)
         self.valid = pose is not None
         # A pile that is used up is dug where it was dug last; `valid` tells.
         self.pose = self.pose if pose is None else pose
@@ -181,13 +200,16 @@ class Rollout:
         }
 
 
-def choose_pose(pile: Pile, place: float, turn: float) -> Float[np.ndarray, "3"] | None:
+def choose_pose(
+    pile: Pile, place: float, turn: float, near: Float[np.ndarray, "2"] | None = None
+) -> Float[np.ndarray, "3"] | None:
     """A dig pose at the toe of a pile as it is: x, y [m] and heading [rad].
 
     Args:
         pile: One pile.
         place: Which of the accessible points of the toe, 0 to 1 along it.
         turn: Heading over the normal into the pile [rad].
+        near: Where to dig, as near as the toe comes to it [m]; then `place` does not count.
 
     Returns:
         The pose; None if there is nothing left to dig.
@@ -199,7 +221,10 @@ def choose_pose(pile: Pile, place: float, turn: float) -> Float[np.ndarray, "3"]
     candidates = np.flatnonzero(toe.accessible)
     if candidates.size == 0:
         return None
-    at = candidates[min(int(place * candidates.size), candidates.size - 1)]
+    if near is None:
+        at = candidates[min(int(place * candidates.size), candidates.size - 1)]
+    else:
+        at = candidates[np.square(toe.points[candidates] - near).sum(axis=1).argmin()]
     return np.array([*toe.points[at], toe.heading[at] + turn], np.float32)
 
 

@@ -34,7 +34,7 @@ SHARD_ATTRIBUTES = ("shard", "shards", "first_cycle", "whole_cycles")
 _SIGNING_TIME = 10.0
 
 
-def identity(layout: Layout, seed: int, simulator: Simulator) -> dict[str, Any]:
+def identity(layout: Layout, seed: int, protocol: str, simulator: Simulator) -> dict[str, Any]:
     """What must agree for two collections to end with the same cycles, as JSON holds it."""
     shard: dict[str, int] = {}
     if layout.shard is not None:
@@ -45,6 +45,7 @@ def identity(layout: Layout, seed: int, simulator: Simulator) -> dict[str, Any]:
         **shard,
         "cycles": layout.size,
         "seed": seed,
+        "protocol": protocol,
         "soil": dataclasses.asdict(simulator.soil),
         "machine": dataclasses.asdict(simulator.machine),
         "settings": dataclasses.asdict(simulator.settings),

@@ -86,8 +86,9 @@ class _Worker:
             number = self.messages.get()["number"]
             if number is None:
                 return None
-            seed, loads, length = (session[name] for name in ("seed", "loads", "length"))
-            return Rollout(number, seed, loads, simulator, length=length)
+            seed, loads = session["seed"], session["loads"]
+            rest = {name: session[name] for name in ("length", "protocol")}
+            return Rollout(number, seed, loads, simulator, **rest)
 
         def put(rollout: Rollout | None) -> None:
             if rollout is None:
