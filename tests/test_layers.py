@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "wlplan"
 # From the bottom to the top: a module imports only from what stands before it.
 LAYERS = [
     *("errors", "types", "units", "precision", "compilation", "io.files"),
-    *("machine", "presets"),
+    *("machine", "loading_cycle", "presets"),
     *("ground", "pile.volumes", "pile.noise", "pile.seeds", "pile.resampling", "pile.outlines"),
     *("pile.toe", "pile"),
     *("heightmap", "characteristics"),
