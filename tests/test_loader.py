@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from wlplan.loading_cycle import SMOOTHING_TIME
 from wlplan.machine import WA320
 from wlplan.simulator import controller, loader
 from wlplan.types import Action
@@ -40,7 +41,7 @@ def test_the_parallel_linkage_keeps_the_tilt():
 
 
 def test_the_tilt_moves_the_edge_on_a_circle_about_the_pin():
-    forward, down = loader.tip_arm(WA320)
+    forward, down = WA320.tip_arm
     assert math.hypot(forward, down) == pytest.approx(WA320.tip_radius)
     # The pin of a level bucket is behind and above its edge.
     pin = tip(0.0, -0.3, 0.0) + np.array([-forward, down])
@@ -173,7 +174,7 @@ def test_smoothing_reaches_its_target_with_its_time_constant(step):
         missing.append(1.0 - float(value))
         value = controller.smooth(value, target, step)
     # The area above the curve is the mean delay, whatever the step.
-    assert sum(missing) * step == pytest.approx(controller.SMOOTHING_TIME + step, rel=2e-2)
+    assert sum(missing) * step == pytest.approx(SMOOTHING_TIME + step, rel=2e-2)
     assert value == pytest.approx(1.0, abs=1e-4)
     assert np.all(np.diff(missing) <= 0.0)
     assert controller.smooth(target, target, step) == 1.0

@@ -74,6 +74,12 @@ class WheelLoader:
     # 145 kN (brochure) at the tip radius is 163 to 181 kN m at the cutting edge.
     tilt_moment: float = 175_000.0
 
+    @property
+    def tip_arm(self) -> tuple[float, float]:
+        """How far the cutting edge of a level, lowered bucket is ahead of and below its pin [m]."""
+        down = self.pivot_height + self.boom_length * math.sin(self.boom_low)
+        return math.sqrt(self.tip_radius**2 - down**2), down
+
 
 @dataclasses.dataclass(frozen=True)
 class Soil:

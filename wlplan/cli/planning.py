@@ -94,7 +94,7 @@ def plan(
     folder = None if out is None else checked_folder(out)
 
     from wlplan.io import plan_to_dict
-    from wlplan.planner import plan_loads, play
+    from wlplan.planner import plan_loads
 
     pile, source = pile_named(pile_file)
     receiver = receiver_at(pile, truck)
@@ -120,11 +120,14 @@ def plan(
             elif planned.refereed is not None:
                 simulated = planned.refereed
             else:
-                progress("simulator", 0, 1, None)
-                simulated = ready(
-                    play(simulator, pile, planned.plan, objective=objective, receiver=receiver)
+                simulated, _ = play_in(
+                    simulator,
+                    pile,
+                    planned.plan,
+                    objective=objective,
+                    receiver=receiver,
+                    progress=progress,
                 )
-                progress("simulator", 1, 1, None)
 
     document = plan_to_dict(
         planned.plan,

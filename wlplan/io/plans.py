@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from wlplan.errors import InputError
-from wlplan.io.files import check_is_file, floats, named, one_line, write_text_atomic
+from wlplan.io.files import check_is_file, named, one_line, write_text_atomic
+from wlplan.precision import floats
 from wlplan.types import Action, LoadingPlan, Performance, Pose
 from wlplan.units import ACTION_HIGH, ACTION_LOW
 

@@ -30,8 +30,9 @@ from scipy import ndimage
 
 from wlplan.errors import InputError
 from wlplan.ground import estimate_ground, fill_unseen
-from wlplan.io.files import check_is_file, floats, named, one_line, write_bytes_atomic
+from wlplan.io.files import check_is_file, named, one_line, write_bytes_atomic
 from wlplan.pile import ground_height, resample
+from wlplan.precision import floats
 from wlplan.types import Pile
 from wlplan.units import CELL_SIZE
 

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.patches import Circle, FancyArrowPatch
+from matplotlib.patches import Circle
 
-from wlplan.plots.paper import BLUE, PANEL_WIDTH
+from wlplan.plots.paper import BLUE, PANEL_WIDTH, add_arrow
 from wlplan.plots.relief import RISE, height_above_ground
 from wlplan.types import Pile
 
@@ -114,19 +114,7 @@ def draw_digs(
     points_per_metre = 72.0 * PANEL_WIDTH / (high - low)
     for number, (dig, towards, label) in enumerate(zip(digs, heading, labels, strict=True), 1):
         tip = dig + reach * np.array([math.cos(towards), math.sin(towards)])
-        panel.add_patch(
-            FancyArrowPatch(
-                tuple(dig),
-                tuple(tip),
-                arrowstyle="-|>",
-                mutation_scale=9.0,
-                color=BLUE,
-                linewidth=1.2,
-                shrinkA=0.0,
-                shrinkB=0.0,
-                zorder=6,
-            )
-        )
+        add_arrow(panel, dig, tip, colour=BLUE, line=1.2, head=9.0, zorder=6)
         panel.add_patch(
             Circle(tuple(label), radius, facecolor=BLUE, edgecolor="white", linewidth=0.8, zorder=8)
         )

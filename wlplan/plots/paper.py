@@ -1,4 +1,4 @@
-"""Paper: colours, figures, axes, and PNG files."""
+"""Paper: colours, figures, axes, arrows, and PNG files."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch
 
 from wlplan.io import write_bytes_atomic
 
@@ -83,3 +84,39 @@ def tidy(panel: Axes, *, grid: bool = True) -> None:
     if grid:
         panel.grid(True, axis="y", color="#e4e7ea", linewidth=0.8)
         panel.set_axisbelow(True)
+
+
+def add_arrow(
+    panel: Axes,
+    start: Float[np.ndarray, "2"],
+    end: Float[np.ndarray, "2"],
+    *,
+    colour: str,
+    line: float,
+    head: float,
+    zorder: int,
+) -> None:
+    """An arrow on a map, from point to point [m].
+
+    Args:
+        panel: The map.
+        start: Where its line begins, without a gap.
+        end: Where its head ends, likewise.
+        colour: Of line and head.
+        line: Width of the line [point].
+        head: Size of the head [point].
+        zorder: Arrows are drawn over what has a smaller one.
+    """
+    panel.add_patch(
+        FancyArrowPatch(
+            tuple(start),
+            tuple(end),
+            arrowstyle="-|>",
+            mutation_scale=head,
+            color=colour,
+            linewidth=line,
+            shrinkA=0.0,
+            shrinkB=0.0,
+            zorder=zorder,
+        )
+    )

@@ -8,9 +8,9 @@ import math
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.patches import FancyArrowPatch, Polygon
+from matplotlib.patches import Polygon
 
-from wlplan.plots.paper import INK
+from wlplan.plots.paper import INK, add_arrow
 from wlplan.transport import Receiver
 
 _TRUCK_REACH = 0.75
@@ -85,19 +85,7 @@ def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> Non
     panel.add_patch(
         Polygon(truck.bed, closed=True, facecolor="#c9ced4", edgecolor="none", zorder=7)
     )
-    panel.add_patch(
-        FancyArrowPatch(
-            tuple(truck.way[0]),
-            tuple(truck.way[1]),
-            arrowstyle="-|>",
-            mutation_scale=11.0,
-            color=INK,
-            linewidth=1.6,
-            shrinkA=0.0,
-            shrinkB=0.0,
-            zorder=7,
-        )
-    )
+    add_arrow(panel, *truck.way, colour=INK, line=1.6, head=11.0, zorder=7)
     panel.annotate(
         "truck",
         tuple(truck.way[0]),

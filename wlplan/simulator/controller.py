@@ -5,11 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from wlplan.loading_cycle import SMOOTHING_TIME
 from wlplan.types import Action
-
-# Forces and commands are smoothed by a first-order lag whose mean delay is that of the paper's
-# moving average over 0.1 s (section 5.2) [s].
-SMOOTHING_TIME = 0.05
 
 
 def command(
@@ -30,5 +27,8 @@ def command(
 def smooth(
     value: Float[Array, "*b"], target: Float[Array, "*b"], step: float
 ) -> Float[Array, "*b"]:
-    """First-order lag over one time step [s]."""
+    """First-order lag of forces and commands over one time step [s].
+
+    Stands for the paper's moving average of the force (section 5.2), with the same mean delay.
+    """
     return value + (target - value) * (step / (SMOOTHING_TIME + step))

@@ -23,22 +23,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from wlplan.compilation import stored
 from wlplan.heightmap import STATE_DISPLACEMENT
+from wlplan.loading_cycle import (
+    BRAKE_TIME,
+    BREAKOUT_CLEARANCE,
+    BREAKOUT_FROM,
+    MAX_FILL_TIME,
+    MAX_PENETRATION,
+)
 from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
 from wlplan.simulator import controller, loader, terrain
 from wlplan.types import Action
 from wlplan.units import CELL_SIZE, GRAVITY
-
-STOP_REASONS = ("tilt_end", "penetration", "breakout", "timeout")
-"""Events that end bucket filling, in the order of `Cycle.stop_reason`. Paper, section 5.2."""
-
-# Limits of the bucket filling: penetration [m] and time [s]. Paper, section 5.2.
-MAX_PENETRATION = 3.2
-MAX_FILL_TIME = 15.0
-# The brake holds for at least this long after the stop [s]. Paper, section 5.2.
-BRAKE_TIME = 0.5
-# A breakout counts from here [m]: at the toe the edge starts level with the surface.
-_BREAKOUT_FROM = 0.3
-_BREAKOUT_CLEARANCE = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +64,7 @@ class Cycle(struct.PyTreeNode):
     work_bucket: Float[Array, ""]  # [J]
     work_slip: Float[Array, ""]  # thrust times slip speed of the wheels [J]
     fill_time: Float[Array, ""]  # from the dig location to the stop [s]
-    stop_reason: Int[Array, ""]  # index into STOP_REASONS
+    stop_reason: Int[Array, ""]  # index into `loading_cycle.STOP_REASONS`
     tip_x: Float[Array, ""]  # cutting edge at the stop [m]
     tip_z: Float[Array, ""]
     height: Float[Array, "52 52"]  # local heightfield afterwards, not relaxed [m]
@@ -277,8 +272,8 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     # Events: each is a margin that reaches zero.
     def surface_margin(tip_x: Array, tip_z: Array) -> Array:
         surface = _interpolated(state.profile, tip_x)
-        early = jnp.maximum(_BREAKOUT_FROM - tip_x, 0.0)
-        return surface + _BREAKOUT_CLEARANCE + early - tip_z
+        early = jnp.maximum(BREAKOUT_FROM - tip_x, 0.0)
+        return surface + BREAKOUT_CLEARANCE + early - tip_z
 
     deadline = state.dig_start + MAX_FILL_TIME
     old_margins = jnp.stack(

@@ -12,13 +12,12 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from wlplan.loading_cycle import ACTUATOR_SATURATION, RETREAT_SPEED
 from wlplan.machine import WheelLoader
 from wlplan.units import GRAVITY
 
 # Slowest speed at which wheel power is turned into force [m/s]; below it traction is the limit.
 _LEAST_SPEED = 0.2
-# An actuator slows down over the last tenth before its stall load.
-_SATURATION = 0.1
 
 
 def bucket_tip(
@@ -28,19 +27,13 @@ def bucket_tip(
     tilt: Float[Array, "*b"],
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """Position of the cutting edge [m]. The linkage keeps the tilt while the boom moves."""
-    forward, down = tip_arm(machine)
+    forward, down = machine.tip_arm
     pin_x = position - forward + machine.boom_length * (jnp.cos(boom) - math.cos(machine.boom_low))
     pin_z = machine.pivot_height + machine.boom_length * jnp.sin(boom)
     # The bucket rests on the ground at the lowest boom angle, whatever the drawing's last digit.
     pin_z = pin_z - machine.pivot_height - machine.boom_length * math.sin(machine.boom_low) + down
     c, s = jnp.cos(tilt), jnp.sin(tilt)
     return pin_x + c * forward + s * down, pin_z + s * forward - c * down
-
-
-def tip_arm(machine: WheelLoader) -> tuple[float, float]:
-    """How far the cutting edge of a level, lowered bucket is ahead of and below its pin [m]."""
-    down = machine.pivot_height + machine.boom_length * math.sin(machine.boom_low)
-    return math.sqrt(machine.tip_radius**2 - down**2), down
 
 
 def boom_force(
@@ -82,7 +75,7 @@ def tilt_moment(
         horizontal: Force of the soil against the direction of travel [N].
         moment: Moment of these forces about the cutting edge, against tilting back [N m].
     """
-    forward, down = tip_arm(machine)
+    forward, down = machine.tip_arm
     c, s = jnp.cos(tilt), jnp.sin(tilt)
     edge_x, edge_z = c * forward + s * down, s * forward - c * down
     # The bucket weighs on the middle of its floor.
@@ -92,7 +85,7 @@ def tilt_moment(
 
 def actuator_speed(load: Float[Array, "*b"], stall: float) -> Float[Array, "*b"]:
     """Part of the commanded speed that an actuator reaches under load [1]."""
-    return jnp.clip((stall - load) / (_SATURATION * stall), 0.0, 1.0)
+    return jnp.clip((stall - load) / (ACTUATOR_SATURATION * stall), 0.0, 1.0)
 
 
 def drive(
@@ -142,7 +135,7 @@ def retreat(
     acceleration_time = 0.5 * total * speed**2 / machine.wheel_power
     # Constant power covers two thirds of speed * time while accelerating.
     time_back = distance / speed + acceleration_time / 3.0
-    time_boom = jnp.abs(machine.boom_carry - boom) / (0.6 * machine.boom_speed)
+    time_boom = jnp.abs(machine.boom_carry - boom) / (RETREAT_SPEED * machine.boom_speed)
     lift = jnp.maximum(math.sin(machine.boom_carry) - jnp.sin(boom), 0.0) * machine.boom_length
     raised = machine.bucket_mass + 0.5 * machine.boom_mass + load_mass
     return (
