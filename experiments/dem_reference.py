@@ -28,7 +28,7 @@ from wlplan.io import write_bytes_atomic
 from wlplan.machine import GRAVEL, WA320
 from wlplan.plots import png_bytes
 from wlplan.simulator import STOP_REASONS, Cycle, dig, terrain
-from wlplan.types import Pile, action_from
+from wlplan.types import Action, Pile, action_from
 from wlplan.units import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 
 _FOLDER = Path(__file__).parents[1] / "tests" / "references"
@@ -54,6 +54,7 @@ MACHINE = dataclasses.replace(
     bucket_heaped=3.05,
 )
 _UNITS = {"mass": "t", "time": "s", "work": "kJ"}
+_ACTION = [field.name for field in dataclasses.fields(Action)]
 # Soil slides in from beyond the local map: it is carried on by this many cells while it does.
 _MARGIN = 10
 # Forces are compared as means over this time [s], in steps of the simulator's [s].
@@ -170,12 +171,16 @@ def forces(reference: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     }
 
 
+def _rank_correlation(one: np.ndarray, other: np.ndarray) -> float:
+    ranks = [np.argsort(np.argsort(values)) for values in (one, other)]
+    return float(np.corrcoef(*ranks)[0, 1])
+
+
 def _agreement(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
-    ranks = [np.argsort(np.argsort(values)) for values in (ours, theirs)]
     return {
         "bias": float(ours.mean() / theirs.mean() - 1.0),
         "bias_of_median": float(np.median(ours) / np.median(theirs) - 1.0),
-        "rank_correlation": float(np.corrcoef(*ranks)[0, 1]),
+        "rank_correlation": _rank_correlation(ours, theirs),
         "mean_relative_difference": float(np.abs(ours / theirs - 1.0).mean()),
         "median_relative_difference": float(np.median(np.abs(ours / theirs - 1.0))),
     }
@@ -269,6 +274,30 @@ def _repeats(
     }
 
 
+def _trends(parts: dict[Path, dict[str, Any]], count: int | None) -> dict[str, Any]:
+    """What goes with a quick controller: rank correlations over all cycles that do not stall."""
+    action = np.concatenate([load(path, count)["action"] for path in parts])
+    moves = np.concatenate(
+        [
+            (np.array(part["stop_reason"]) != "timeout")
+            & (np.array(part["reference_stop_reason"]) != "timeout")
+            for part in parts.values()
+        ]
+    )
+    result: dict[str, Any] = {"cycles": int(moves.sum())}
+    for who in ("ours", "reference"):
+        mass, time, work = (
+            np.concatenate([part[who][name] for part in parts.values()])[moves] for name in _UNITS
+        )
+        causes = {"time": time, **dict(zip(_ACTION, action[moves].T, strict=True))}
+        effects = {"productivity": mass / time, "work_per_tonne": work / mass}
+        result[who] = {
+            effect: {cause: _rank_correlation(of, by) for cause, by in causes.items()}
+            for effect, of in effects.items()
+        }
+    return result
+
+
 def run(preset: str) -> dict[str, Any]:
     """Plays the reference's actions on the reference's surfaces with its machine constants."""
     count = 5 if preset == "smoke" else None
@@ -279,7 +308,9 @@ def run(preset: str) -> dict[str, Any]:
         name: np.round(shown[name][:end, 0], 3).tolist()
         for name in ("time", "ours_x", "theirs_x", "ours_z", "theirs_z")
     }
-    return {"fitted": _of_part(REFERENCE, count), "held_out": held_out, "example": example}
+    fitted = _of_part(REFERENCE, count)
+    trends = _trends({REFERENCE: fitted, HELD_OUT: held_out}, count)
+    return {"fitted": fitted, "held_out": held_out, "trends": trends, "example": example}
 
 
 def draw(folder: Path) -> None:
