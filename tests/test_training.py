@@ -11,10 +11,11 @@ import optax
 import pytest
 from flax import nnx
 
-from wlplan.dataset import VARIABLES, Dataset
+from wlplan.dataset import VARIABLES, Dataset, split
 from wlplan.errors import InputError
 from wlplan.models.performance import PsiLow
 from wlplan.training import (
+    LOSSES,
     evaluate_performance,
     fitting,
     held_out,
@@ -208,6 +209,50 @@ def test_only_the_test_part_of_the_training_data_is_held_out(saved, data):
 # --- models on disk
 
 
+def test_of_several_data_sets_each_has_its_own_test_part(data, tmp_path):
+    other = synthetic(rollouts=20, seed=1)
+    short = LIGHT | {"epochs": 1}
+    _, report = train_psi_low([data, other], out=tmp_path / "model", **short)
+    description = read_description(tmp_path / "model")
+    parts = [held_out(each, description) for each in (data, other)]
+    assert [len(set(part.rollout)) for part in parts] == [
+        len(set(split(each)[2].rollout)) for each in (data, other)
+    ]
+    assert report.every.cycles == sum(map(len, parts))
+    assert len(held_out(synthetic(seed=2), description)) == len(data)
+    # Alone, the first data set keeps the same test part: its errors can be compared.
+    train_psi_low(data, out=tmp_path / "alone", **short)
+    alone = held_out(data, read_description(tmp_path / "alone"))
+    np.testing.assert_array_equal(alone.mass, parts[0].mass)
+
+
+def test_data_sets_of_other_soils_are_not_joined(data):
+    other = dataclasses.replace(data, attributes={"soil": {"density": 1500.0}})
+    refused(lambda: train_psi_low([data, other], **LIGHT), "soil")
+
+
+def test_few_cycles_that_are_far_off_do_not_spoil_the_rest(data):
+    random = np.random.default_rng(0)
+    stalls = random.random(len(data)) < 0.03
+    time = np.where(stalls, data.time + 60.0, data.time).astype(np.float32)
+    stalled = dataclasses.replace(data, time=time)
+    errors = {}
+    for loss in LOSSES:
+        model, _ = train_psi_low(stalled, loss=loss, **LIGHT)
+        errors[loss] = evaluate_performance(model, data).every.mean_absolute["time"]
+    assert errors["huber"] < 0.5 * errors["squared"]
+    refused(lambda: train_psi_low(data, loss="cubed", **LIGHT), "huber, squared")
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_small_errors_count_by_their_square(loss):
+    errors = jnp.array([1e-2, -2e-2])
+    small, double = fitting.of_errors(errors, loss)
+    assert float(double / small) == pytest.approx(4.0, rel=0.02)
+    large, double = fitting.of_errors(jnp.array([10.0, -20.0]), loss)
+    assert float(double / large) == pytest.approx({"huber": 2.0, "squared": 4.0}[loss], rel=0.02)
+
+
 def test_a_model_comes_back_bit_by_bit_and_the_directory_stays_as_it_is(saved):
     directory, model, _ = saved
     before = contents(directory)
@@ -238,7 +283,7 @@ def test_the_description_says_where_a_model_comes_from(saved, data):
     assert description["kind"] == "psi_low"
     assert description["architecture"]["hidden"] == [32, 32]
     assert description["dataset"]["soil"] == data.attributes["soil"]
-    assert description["dataset"]["fingerprint"].startswith("sha256:")
+    assert description["dataset"]["fingerprints"][0].startswith("sha256:")
     assert description["held_out"]["loaded"]["mean_relative"]["mass"] < 0.02
     assert set(description["versions"]) >= {"wlplan", "jax", "numpy"}
 

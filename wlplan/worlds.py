@@ -25,6 +25,7 @@ from wlplan.heightmap import (
     sample_local,
 )
 from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
+from wlplan.models.ensemble import Ensemble
 from wlplan.models.height_change import HeightChangeModel
 from wlplan.models.performance import PerformanceModel
 from wlplan.models.performance_high import HighPerformanceModel
@@ -32,7 +33,15 @@ from wlplan.models.pile_state import PileStateModel
 from wlplan.presets import check_machine, check_soil
 from wlplan.simulator import Simulator
 from wlplan.training import load_model, read_description
-from wlplan.types import Action, Performance, Pile, Pose, World, action_vector
+from wlplan.types import (
+    Action,
+    LocalHeightmap,
+    Performance,
+    Pile,
+    Pose,
+    World,
+    action_vector,
+)
 from wlplan.units import KG_PER_TONNE
 
 WORLDS = ("low", "high", "hybrid", "simulator")
@@ -40,12 +49,15 @@ WORLDS = ("low", "high", "hybrid", "simulator")
 ENGINES = ("simulator", "dem")
 """Names that `load_world` knows, to play plans in; "dem" is too slow to plan in."""
 
+MODELS = {"low": ("psi_low",), "hybrid": ("psi_high",), "high": ("psi_high", "phi")}
+"""The models of each learned world, by the names under which they ship."""
+
 
 @no_type_check
 class LowWorld(struct.PyTreeNode):
     """The low-dimensional world: ψ_low, mass removal along the strip, automaton. Paper, 4.6."""
 
-    model: PerformanceModel
+    model: PerformanceModel | Ensemble
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
@@ -55,16 +67,22 @@ class LowWorld(struct.PyTreeNode):
 
         Where the strip holds less than the model predicts, the load is what is there.
         """
-        local = characteristics(sample_local(pile, pose))
-        predicted = self.model(as_vector(local), action_vector(action))
+        predicted = self.model(self._view(pile, pose), action_vector(action))
         return _dug_and_settled(self, pile, pose, predicted)
+
+    def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
+        """Standard deviation of what the performance is off, see `_deviation`."""
+        return _deviation(self.model, self._view(pile, pose), action)
+
+    def _view(self, pile: Pile, pose: Pose) -> Float[Array, "4"]:
+        return as_vector(characteristics(sample_local(pile, pose)))
 
 
 @no_type_check
 class HybridWorld(struct.PyTreeNode):
     """The hybrid world: ψ_high, mass removal along the strip, automaton. Paper, 4.6."""
 
-    model: HighPerformanceModel
+    model: HighPerformanceModel | Ensemble
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
@@ -77,6 +95,10 @@ class HybridWorld(struct.PyTreeNode):
         predicted = self.model(sample_local(pile, pose), action_vector(action))
         return _dug_and_settled(self, pile, pose, predicted)
 
+    def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
+        """Standard deviation of what the performance is off, see `_deviation`."""
+        return _deviation(self.model, sample_local(pile, pose), action)
+
 
 @no_type_check
 class HighWorld(struct.PyTreeNode):
@@ -84,12 +106,19 @@ class HighWorld(struct.PyTreeNode):
 
     With φ of ours exactly the mass that it reports leaves the pile. φ of the paper changes the pile
     by whatever volume it predicts, and the mass is that of ψ_high.
+
+    With `settle` the automaton lets the predicted surface slide, which keeps its volume: a pile
+    that was within the schedule's tolerance of the angle of repose is so afterwards. Over 8
+    held-out rollouts of 30 loads that takes 71 ms in place of 29, and leaves a pile that differs
+    from the simulator's by 3.0 m³ in place of 6.6, at most 33° steep in place of 83°.
     """
 
-    model: HighPerformanceModel
+    model: HighPerformanceModel | Ensemble
     pile_state: HeightChangeModel | PileStateModel
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
+    schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
+    settle: bool = struct.field(pytree_node=False, default=True)
 
     def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         """The pile and the performance after one loading.
@@ -109,11 +138,45 @@ class HighWorld(struct.PyTreeNode):
         else:
             change = self.pile_state(local, vector) - local.height
         height = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
-        after = pile.replace(height=paste(pile.height, height, jnp.stack(start)))
+        if self.settle:
+            after = settle_dug(
+                pile,
+                height,
+                start,
+                repose_angle=self.soil.repose_angle,
+                schedule=self.schedule,
+            )
+        else:
+            after = pile.replace(height=paste(pile.height, height, jnp.stack(start)))
         if exact:
             left = (window.height - height).sum() * pile.cell_size**2
             predicted = predicted.replace(mass=left * per_volume)
         return after, predicted
+
+    def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
+        """Standard deviation of what the performance is off, see `_deviation`."""
+        return _deviation(self.model, sample_local(pile, pose), action)
+
+
+def _deviation(
+    model: PerformanceModel | HighPerformanceModel | Ensemble,
+    view: Float[Array, "4"] | LocalHeightmap,
+    action: Action,
+) -> Performance:
+    """Standard deviation of what a predicted performance is off [tonne, s, kJ].
+
+    It is that of one loading on the pile as given, whatever came before, and of what the model
+    predicts: where less is there to be loaded, it does not shrink. Differentiable.
+
+    Raises:
+        InputError: If the model is no ensemble.
+    """
+    if not isinstance(model, Ensemble):
+        raise InputError(
+            "the model of this world is a single one and does not tell how far it may be off: "
+            "train an ensemble with `wlplan train --members 5`"
+        )
+    return model.with_deviation(view, action_vector(action))[1]
 
 
 def _above_floor(pile: Pile, pose: Pose) -> Float[Array, "52 52"]:
@@ -143,16 +206,6 @@ def pretrained_path(name: str) -> Path:
     return Path(str(resources.files("wlplan") / "pretrained" / name))
 
 
-def _model_directory(kind: str, world: str, model: str | Path | None) -> Path:
-    directory = pretrained_path(kind) if model is None else Path(model)
-    if model is None and not directory.is_dir():
-        raise InputError(
-            f"the {world} world needs {kind}, which does not ship yet: name a trained one, or use "
-            f"low or simulator"
-        )
-    return directory
-
-
 def load_world(
     name: str,
     *,
@@ -164,12 +217,11 @@ def load_world(
     """A world by name.
 
     Args:
-        name: "low" (ψ_low and the automaton), "hybrid" (ψ_high and the automaton; its weights do
-            not ship yet), "high" (ψ_high and φ; nor do those) or "simulator". "dem" is the
-            discrete-element engine, which takes minutes a loading, has no derivative, and needs
-            `pip install 'wlplan[dem]'`.
-        model: Directory of a trained model to use in place of the pretrained one.
-        pile_state: For "high", directory of a trained φ, of either kind.
+        name: "low" (ψ_low and the automaton), "hybrid" (ψ_high and the automaton), "high" (ψ_high
+            and φ) or "simulator". "dem" is the discrete-element engine, which takes minutes a
+            loading, has no derivative, and needs `pip install 'wlplan[dem]'`.
+        model: Directory of a trained ψ to use in place of the one that ships.
+        pile_state: For "high", directory of a trained φ, of either kind, likewise.
         soil: What is dug. A learned world takes from it the density, by which it turns mass into
             volume, and the angle of repose; what it predicts is for the soil of its training.
         machine: What digs. A learned world takes from it the width of the bucket.
@@ -184,21 +236,18 @@ def load_world(
         return Simulator(machine=machine, soil=soil)
     if name == "dem":
         return DiscreteElements(machine=machine, soil=soil)
-    if name == "low":
-        directory = pretrained_path("psi_low") if model is None else Path(model)
-        low: Any = load_model(directory)
-        return LowWorld(low, machine=machine, soil=soil)
-    if name == "hybrid":
-        directory = _model_directory("psi_high", name, model)
-        high: Any = load_model(directory, "psi_high")
-        return HybridWorld(high, machine=machine, soil=soil)
-    if name == "high":
-        psi: Any = load_model(_model_directory("psi_high", name, model), "psi_high")
-        place = _model_directory("phi", name, pile_state)
+    if name in MODELS:
+        psi, *others = MODELS[name]
+        predictor: Any = load_model(pretrained_path(psi) if model is None else model, psi)
+        if name == "low":
+            return LowWorld(predictor, machine=machine, soil=soil)
+        if name == "hybrid":
+            return HybridWorld(predictor, machine=machine, soil=soil)
+        place = pretrained_path(others[0]) if pile_state is None else Path(pile_state)
         phi: Any = load_model(place, read_description(place, kind=None)["kind"])
         if not isinstance(phi, HeightChangeModel | PileStateModel):
             raise InputError(f"{place}: is not a pile state model: name one of `train phi`.")
-        return HighWorld(psi, phi, machine=machine, soil=soil)
+        return HighWorld(predictor, phi, machine=machine, soil=soil)
     raise InputError(
         f"unknown world {name!r}; choose one of {', '.join(dict.fromkeys((*WORLDS, *ENGINES)))}"
     )

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import click
 
 from wlplan.cli.inputs import (
-    check_model,
+    check_models,
     check_pile_name,
+    model_fields,
     pile_named,
     receiver_at,
     receiver_fields,
@@ -17,7 +18,7 @@ from wlplan.cli.inputs import (
 )
 from wlplan.cli.options import (
     loads_option,
-    model_option,
+    model_options,
     objective_option,
     out_option,
     pile_argument,
@@ -64,7 +65,7 @@ _VERDICTS = {"ok": ("ok", None), "kink": ("kink", "yellow"), "wrong": ("WRONG", 
         "simulator, where the derivative of the earthmoving force is approximate, 3e-3.",
     ),
     *site_options(),
-    model_option,
+    *model_options,
     out_option,
 )
 def gradcheck(
@@ -77,6 +78,7 @@ def gradcheck(
     soil: str | None,
     machine: str | None,
     model: str | None,
+    pile_state: str | None,
     out: str | None,
     seed: int,
     as_json: bool,
@@ -88,7 +90,7 @@ def gradcheck(
     wrong. With --out: gradcheck.json.
     """
     check_pile_name(pile_file)
-    check_model(model, world_name)
+    check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
     in_simulator = world_name == "simulator"
     if in_simulator and loads > _MOST_LOADS_SIMULATOR:
@@ -106,7 +108,7 @@ def gradcheck(
     if tolerance is None:
         tolerance = SIMULATOR_TOLERANCE if in_simulator else TOLERANCE
     pile, source = pile_named(pile_file)
-    world, receiver = world_named(world_name, site, model), receiver_at(pile, None)
+    world, receiver = world_named(world_name, site, model, pile_state), receiver_at(pile, None)
     checked_plan = random_plan(pile, loads, seed=seed)
     with Progress() as progress, Stopwatch() as checking:
         check = check_gradient(
@@ -122,7 +124,7 @@ def gradcheck(
         "pile": source,
         **site.fields(),
         "world": world_name,
-        **({} if model is None else {"model": model}),
+        **model_fields(model, pile_state),
         "objective": objective,
         "seed": seed,
         "receiver": receiver_fields(receiver),

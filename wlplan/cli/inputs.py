@@ -74,17 +74,27 @@ def check_pile_name(name: str) -> None:
         )
 
 
-def check_model(name: str | None, world: str) -> None:
-    """Refuses a model that is no folder, or that the world does not take.
+def check_models(model: str | None, pile_state: str | None, world: str) -> None:
+    """Refuses models that are no folders, or that the world does not take.
 
     Raises:
         InputError: If so.
     """
-    if name is None:
-        return
-    if world not in ("low", "hybrid"):
-        raise InputError(f"--model does not go with --world {world}: leave one of them out.")
-    check_is_folder(name, "model", "wlplan train")
+    for name, option, takers in (
+        (model, "--model", ("low", "high", "hybrid")),
+        (pile_state, "--pile-state", ("high",)),
+    ):
+        if name is None:
+            continue
+        if world not in takers:
+            raise InputError(f"{option} does not go with --world {world}: leave one of them out.")
+        check_is_folder(name, "model", "wlplan train")
+
+
+def model_fields(model: str | None, pile_state: str | None) -> dict[str, str]:
+    """What plan.json and the like say about models in place of those that ship."""
+    given = {"model": model, "pile_state": pile_state}
+    return {name: path for name, path in given.items() if path is not None}
 
 
 def check_is_folder(name: str, what: str, maker: str) -> None:
@@ -180,31 +190,37 @@ def _record(document: Mapping[str, Any], part: str) -> tuple[str, object]:
     return record["name"], record.get("parameters")
 
 
-def world_named(name: str, site: Site, model: str | None = None) -> World:
+def world_named(
+    name: str, site: Site, model: str | None = None, pile_state: str | None = None
+) -> World:
     """A world of `WORLDS` at a site.
 
-    Tells on stderr if it is learned and its model was trained for another site.
+    Tells on stderr if it is learned and a model of it was trained for another site.
 
     Args:
         name: Name of the world.
         site: What is dug and what digs.
-        model: Folder of a model in place of the one that ships with the package.
+        model: Folder of a ψ in place of the one that ships with the package.
+        pile_state: Folder of a φ likewise, for the high world.
     """
-    from wlplan.worlds import load_world
+    from wlplan.worlds import MODELS, load_world
 
-    world = load_world(name, model=model, soil=site.soil, machine=site.machine)
-    if name in ("low", "hybrid"):
-        _remark_on_training("psi_low" if name == "low" else "psi_high", model, site)
+    # Only the high world asks for it.
+    second = {} if pile_state is None else {"pile_state": pile_state}
+    world = load_world(name, model=model, soil=site.soil, machine=site.machine, **second)
+    for kind, given in zip(MODELS.get(name, ()), (model, pile_state), strict=False):
+        if _remark_on_training(kind, given, site):
+            break
     return world
 
 
-def _remark_on_training(kind: str, model: str | None, site: Site) -> None:
+def _remark_on_training(kind: str, model: str | None, site: Site) -> bool:
     """Tell if a model was trained for another soil or machine than those of a site."""
     from wlplan.training import read_description
     from wlplan.worlds import pretrained_path
 
     folder = pretrained_path(kind) if model is None else Path(model)
-    data = read_description(folder, kind).get("dataset")
+    data = read_description(folder, None).get("dataset")
     data = data if isinstance(data, dict) else {}
     trained = {part: data.get(part) for part in ("soil", "machine")}
     # A description may say nothing of them: data of one's own do not have to.
@@ -224,6 +240,7 @@ def _remark_on_training(kind: str, model: str | None, site: Site) -> None:
             f"the model was trained for {soil} and {machine}, not for {' and '.join(others)}: "
             f"what it predicts is for those"
         )
+    return bool(others)
 
 
 def _name_among(presets: Mapping[str, Any], recorded: Any, otherwise: str) -> str:

@@ -10,10 +10,11 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from wlplan.cli.inputs import check_is_folder, check_model, site_named
+from wlplan.cli.inputs import check_is_folder, site_named
 from wlplan.cli.options import (
     ACTIVATIONS,
     ENCODERS,
+    LOSSES,
     PROTOCOLS,
     LayerUnits,
     ShardNumber,
@@ -155,14 +156,31 @@ def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
 
 
 # Names of the models on the command line.
-_KINDS = ("psi-low", "psi-high", "phi", "phi-vae")
+_KINDS = ("psi-low", "psi-high", "phi", "phi-vae", "all")
+# Options that not every model takes.
+_TAKERS = {
+    "encoder": ("psi-high",),
+    "activation": ("psi-low", "psi-high", "phi"),
+    "hidden": ("psi-low", "psi-high", "phi", "phi-vae"),
+    "dropout": ("psi-low", "psi-high", "phi", "phi-vae"),
+    "members": ("psi-low", "psi-high"),
+    "loss": ("psi-low", "psi-high"),
+}
+# Largest ensemble: beyond some ten members nothing is gained.
+_MOST_MEMBERS = 100
 
 
 @click.command()
 @click.argument("kind", metavar="MODEL", type=click.Choice(_KINDS))
 @with_options(
-    click.option("--data", metavar="DATA.zarr", required=True, help="Data set to train on."),
-    click.option("--out", metavar="DIR", required=True, help="Folder of the model."),
+    click.option(
+        "--data",
+        metavar="DATA.zarr",
+        required=True,
+        multiple=True,
+        help="Data set to train on, or several of them; for all one, collected if it is missing.",
+    ),
+    click.option("--out", metavar="DIR", required=True, help="Folder of the model, or of all."),
     click.option(
         "--epochs",
         type=click.IntRange(1, 100_000),
@@ -193,45 +211,67 @@ _KINDS = ("psi-low", "psi-high", "phi", "phi-vae")
         default=None,
         help="psi-high: what tells it about the map, the paper's convolutions or (default) ours.",
     ),
+    click.option(
+        "--loss",
+        type=click.Choice(LOSSES),
+        default=None,
+        help="psi-low, psi-high: what an error counts. Default: huber; squared is the paper's.",
+    ),
+    click.option(
+        "--members",
+        type=click.IntRange(1, _MOST_MEMBERS),
+        default=None,
+        help="psi-low, psi-high: an ensemble of so many, which tells how far it may be off.",
+    ),
 )
 def train(
     kind: str,
-    data: str,
+    data: tuple[str, ...],
     out: str,
     epochs: int | None,
     activation: str | None,
     hidden: tuple[int, ...] | None,
     dropout: float | None,
     encoder: str | None,
+    loss: str | None,
+    members: int | None,
     seed: int,
     as_json: bool,
 ) -> None:
     """Train MODEL on a data set and report its errors on cycles that it has not seen.
 
     MODEL is psi-low or psi-high, which predict the performance, phi, which predicts the pile state,
-    or phi-vae, which does so as in the paper.
+    or phi-vae, which does so as in the paper; or all: the models that ship, as they ship.
 
     Interrupted, the same command goes on where it stopped.
     """
-    check_is_folder(data, "data set", "wlplan collect")
-    checked_folder(out)
-    if encoder is not None and kind != "psi-high":
-        raise InputError(f"--encoder does not go with {kind}: leave it out.")
-    if activation is not None and kind == "phi-vae":
-        raise InputError(f"--activation does not go with {kind}: leave it out.")
     chosen = {
         "epochs": epochs,
         "activation": activation,
         "hidden": hidden,
         "dropout": dropout,
         "encoder": encoder,
+        "loss": loss,
+        "members": members,
     }
     settings = {name: value for name, value in chosen.items() if value is not None}
+    for name in settings:
+        if kind not in _TAKERS.get(name, _KINDS):
+            raise InputError(f"--{name} does not go with {kind}: leave it out.")
+    if kind == "all":
+        checked_folder(out)
+        if len(data) > 1:
+            raise InputError("--data names one place for all: the other data set lies beside it.")
+        _train_all(data[0], out, epochs=epochs, seed=seed, as_json=as_json)
+        return
+    for each in data:
+        check_is_folder(each, "data set", "wlplan collect")
+    checked_folder(out)
 
     from wlplan import training as trainers
     from wlplan.dataset import open_dataset
 
-    dataset = open_dataset(data)
+    dataset = [open_dataset(each) for each in data]
     trainer: Any = getattr(trainers, f"train_{kind.replace('-', '_')}")
     with Progress() as progress, Stopwatch() as training:
         _, report = trainer(
@@ -244,13 +284,37 @@ def train(
     if as_json:
         click.echo(json_text({"model": kind, "out": out, "held_out": report.as_dict()}))
         return
-    title = f"{kind}, held-out part of {data}"
+    title = f"{kind}, held-out part of {', '.join(data)}"
     if kind.startswith("phi"):
         _print_pile_state(title, [("", report.as_dict())])
     else:
         _print_errors(title, report.as_dict())
     print(f"training {training.text()}")
     print(f"written: {out}")
+
+
+def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: bool) -> None:
+    from wlplan.training import train_all
+
+    with Progress() as progress, Stopwatch() as training:
+        reports = train_all(
+            data,
+            out,
+            seed=seed,
+            epochs=epochs,
+            progress=lambda stage, done, total: progress(stage, done, total, None),
+        )
+    if as_json:
+        click.echo(json_text({"model": "all", "out": out, "held_out": reports}))
+        return
+    for kind, report in reports.items():
+        title = f"{kind.replace('_', '-')}, held-out part of {data}"
+        if kind == "phi":
+            _print_pile_state(title, [("", report)])
+        else:
+            _print_errors(title, report)
+    print(f"training {training.text()}")
+    print(f"written: {', '.join(str(Path(out) / kind) for kind in reports)}")
 
 
 @click.command()
@@ -267,7 +331,8 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     belongs to the model, so --seed changes nothing.
     """
     check_is_folder(data, "data set", "wlplan collect")
-    check_model(model, "low")
+    if model is not None:
+        check_is_folder(model, "model", "wlplan train")
 
     from wlplan.dataset import open_dataset
     from wlplan.training import (
@@ -344,4 +409,11 @@ def _print_errors(title: str, report: Mapping[str, Any]) -> None:
         for key, label, write in kinds:
             cells = (write(part[key][q], unit) for q, (_, unit, _) in QUANTITIES.items())
             table.add_row(f"{label}, {which}", str(part["cycles"]), *cells)
+    if "intervals" in report:
+        inside = (report["intervals"][q]["coverage"] for q in QUANTITIES)
+        table.add_row(
+            "inside the interval of 90 %, all valid cycles",
+            str(report["every"]["cycles"]),
+            *(f"{100.0 * part:.1f} %" for part in inside),
+        )
     print_table(table)

@@ -7,10 +7,17 @@ import math
 
 import click
 
-from wlplan.cli.inputs import check_model, check_pile_name, pile_named, site_named, world_named
+from wlplan.cli.inputs import (
+    check_models,
+    check_pile_name,
+    model_fields,
+    pile_named,
+    site_named,
+    world_named,
+)
 from wlplan.cli.options import (
     ActionNumbers,
-    model_option,
+    model_options,
     out_option,
     pile_argument,
     site_options,
@@ -50,7 +57,7 @@ _MOST_LOCATIONS = 10_000
     ),
     world_option,
     *site_options(),
-    model_option,
+    *model_options,
     out_option,
 )
 def diggability(
@@ -61,6 +68,7 @@ def diggability(
     soil: str | None,
     machine: str | None,
     model: str | None,
+    pile_state: str | None,
     out: str | None,
     seed: int,
     as_json: bool,
@@ -70,7 +78,7 @@ def diggability(
     With --out: diggability.png and diggability.json. Nothing is random, so --seed changes nothing.
     """
     check_pile_name(pile_file)
-    check_model(model, world_name)
+    check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
     folder = None if out is None else checked_folder(out)
 
@@ -80,7 +88,7 @@ def diggability(
     from wlplan.types import Action
 
     pile, source = pile_named(pile_file)
-    world = world_named(world_name, site, model)
+    world = world_named(world_name, site, model, pile_state)
     fixed = Action(*action)  # type: ignore[arg-type]
     with Progress() as progress, Stopwatch() as mapping:
         progress("diggability", 0, 1, None)
@@ -106,7 +114,7 @@ def diggability(
         "pile": source,
         **site.fields(),
         "world": world_name,
-        **({} if model is None else {"model": model}),
+        **model_fields(model, pile_state),
         "action": dict(zip(names, action, strict=True)),
         "summary": summary,
         "locations": [

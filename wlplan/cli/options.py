@@ -20,6 +20,7 @@ OBJECTIVES = ("efficiency", "productivity", "energy")
 ACTIVATIONS = ("swish", "leaky_relu")
 ENCODERS = ("convolutional", "principal")
 PROTOCOLS = ("paper", "corridor")
+LOSSES = ("huber", "squared")
 
 BUNDLED = "bundled"
 """What stands for the pile that ships with the package where a file is asked for."""
@@ -212,11 +213,20 @@ engine_option = click.option(
     show_default=True,
     help="What plays: the simulator or discrete elements (minutes a load; wlplan[dem]).",
 )
-model_option = click.option(
-    "--model",
-    metavar="DIR",
-    default=None,
-    help="Model from `wlplan train` in place of the one that ships with the package.",
+model_options = (
+    click.option(
+        "--model",
+        metavar="DIR",
+        default=None,
+        help="ψ from `wlplan train` in place of the one that ships: psi-low for --world low, "
+        "psi-high for high and hybrid.",
+    ),
+    click.option(
+        "--pile-state",
+        metavar="DIR",
+        default=None,
+        help="φ from `wlplan train`, for --world high, in place of the one that ships.",
+    ),
 )
 truck_option = click.option(
     "--truck",

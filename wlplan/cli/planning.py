@@ -12,8 +12,9 @@ import click
 from wlplan.cli.engines import play_in
 from wlplan.cli.inputs import (
     RECEIVER_FIELDS,
-    check_model,
+    check_models,
     check_pile_name,
+    model_fields,
     pile_named,
     receiver_at,
     receiver_fields,
@@ -26,7 +27,7 @@ from wlplan.cli.options import (
     PLANNERS,
     engine_option,
     loads_option,
-    model_option,
+    model_options,
     objective_option,
     out_option,
     pile_argument,
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
 
 _MOST_LOADS = 500
 # What a plan says about where it comes from; playing it again keeps that.
-_ORIGIN_FIELDS = ("world", "model", "planner", "seed")
+_ORIGIN_FIELDS = ("world", "model", "pile_state", "planner", "seed")
 
 
 @click.command()
@@ -66,7 +67,7 @@ _ORIGIN_FIELDS = ("world", "model", "planner", "seed")
     ),
     truck_option,
     *site_options(),
-    model_option,
+    *model_options,
     out_option,
 )
 def plan(
@@ -80,6 +81,7 @@ def plan(
     soil: str | None,
     machine: str | None,
     model: str | None,
+    pile_state: str | None,
     out: str | None,
     seed: int,
     as_json: bool,
@@ -89,7 +91,7 @@ def plan(
     With --out: plan.json, plan.png, totals.png and report.html, which shows everything.
     """
     check_pile_name(pile_file)
-    check_model(model, world_name)
+    check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
     folder = None if out is None else checked_folder(out)
 
@@ -98,7 +100,10 @@ def plan(
 
     pile, source = pile_named(pile_file)
     receiver = receiver_at(pile, truck)
-    world, simulator = world_named(world_name, site, model), world_named("simulator", site)
+    world, simulator = (
+        world_named(world_name, site, model, pile_state),
+        world_named("simulator", site),
+    )
     with Progress() as progress:
         with Stopwatch() as planning:
             planned = ready(
@@ -141,7 +146,7 @@ def plan(
         objective=objective,
         referee=referee,
         seed=seed,
-        **({} if model is None else {"model": model}),
+        **model_fields(model, pile_state),
         receiver=receiver_fields(receiver),
         total={
             "predicted": totals(planned.rollout.performance, planned.cost),

@@ -13,9 +13,10 @@ reason shards, collected apart and joined, are the data set of a single collecto
 
 from wlplan.dataset.collecting import collect
 from wlplan.dataset.merging import merge
+from wlplan.dataset.probes import differences, probes_of
 from wlplan.dataset.protocol import PROTOCOLS
 from wlplan.dataset.store import DATASET_FORMAT, open_dataset, versions
-from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, fingerprint, reflect, split
+from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, fingerprint, join, reflect, split
 
 __all__ = [
     "DATASET_FORMAT",
@@ -24,9 +25,12 @@ __all__ = [
     "VARIABLES",
     "Dataset",
     "collect",
+    "differences",
     "fingerprint",
+    "join",
     "merge",
     "open_dataset",
+    "probes_of",
     "reflect",
     "split",
     "versions",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -143,6 +143,29 @@ class Dataset:
     def select(self, which: Int[np.ndarray, " k"] | Bool[np.ndarray, " n"]) -> Dataset:
         """The cycles of an index array or a mask."""
         return dataclasses.replace(self, **{name: getattr(self, name)[which] for name in VARIABLES})
+
+
+def join(datasets: Sequence[Dataset]) -> Dataset:
+    """Data sets in a row, their rollouts numbered on; the attributes are those of the first.
+
+    Raises:
+        InputError: If they are of different soils or machines.
+    """
+    first = datasets[0]
+    for other in datasets[1:]:
+        for name in ("soil", "machine"):
+            if other.attributes.get(name) != first.attributes.get(name):
+                raise InputError(
+                    f"The data sets are of another {name} each: a model is trained for one."
+                )
+    columns: dict[str, Any] = {
+        name: np.concatenate([getattr(d, name) for d in datasets]) for name in VARIABLES
+    }
+    ends = np.cumsum([0, *(d.rollout.max(initial=-1) + 1 for d in datasets)])
+    columns["rollout"] = np.concatenate(
+        [d.rollout + int(start) for d, start in zip(datasets, ends, strict=False)]
+    ).astype(first.rollout.dtype)
+    return dataclasses.replace(first, **columns)
 
 
 def fingerprint(dataset: Dataset) -> str:

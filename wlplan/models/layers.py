@@ -28,6 +28,10 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 # choice: enough for a slope or an action at the very edge of the data, not for another regime.
 _MARGIN = 0.25
 
+# Variance of an error that a network begins with, over that of the data, and the largest exponent
+# by which it can differ from it: a factor of 150 in the standard deviation up and down.
+_USUAL_VARIANCE, _LARGEST_EXPONENT = 0.135, 5.0
+
 
 class Standardiser(nnx.Module):
     """Mean and spread of the training data, to which a network scales; not trained.
@@ -59,6 +63,10 @@ class Standardiser(nnx.Module):
         """Errors of such values in units of the spread."""
         return errors / self._like(errors)[1]
 
+    def of_spreads(self, errors: Float[Array, "*batch k"]) -> Float[Array, "*batch k"]:
+        """The inverse of `in_spreads`."""
+        return errors * self._like(errors)[1]
+
     def _like(self, values: Array) -> tuple[Array, Array]:
         # Spelt out, since ranks are never promoted silently.
         return (
@@ -80,6 +88,8 @@ class Mlp(nnx.Module):
         activation: Name of the activation function, one of `ACTIVATIONS`.
         dropout: Part of the hidden units that is dropped in training.
         standardised: False: without the two scalings, as the first models were.
+        scattered: True: with a second layer of outputs, that tells how far they may be off, see
+            `outputs_and_variances`.
         rngs: Random streams of the initial weights.
 
     Raises:
@@ -95,6 +105,7 @@ class Mlp(nnx.Module):
         activation: str,
         dropout: float,
         standardised: bool = True,
+        scattered: bool = False,
         rngs: nnx.Rngs,
     ):
         check_activation(activation)
@@ -105,6 +116,7 @@ class Mlp(nnx.Module):
         widths = (inputs, *hidden)
         self.hidden = nnx.List(nnx.Linear(n, m, rngs=rngs) for n, m in itertools.pairwise(widths))
         self.output = nnx.Linear(widths[-1], outputs, rngs=rngs)
+        self.scatter = nnx.Linear(widths[-1], outputs, rngs=rngs) if scattered else None
         # Without streams of its own it holds no state: the weights are all there is to save.
         self.dropout = nnx.Dropout(dropout)
         self.activation = activation
@@ -115,16 +127,40 @@ class Mlp(nnx.Module):
         self, inputs: Float[Array, "*batch n"], *, rngs: nnx.Rngs | None = None
     ) -> Float[Array, "*batch m"]:
         """Outputs of the last, linear layer; `rngs` switches dropout on."""
+        return self._restored(self.output(self._hidden(inputs, rngs)))
+
+    def outputs_and_variances(
+        self, inputs: Float[Array, "*batch n"], *, rngs: nnx.Rngs | None = None
+    ) -> tuple[Float[Array, "*batch m"], Float[Array, "*batch m"]]:
+        """Outputs, and the variance of what they are off, in units of their squared spread.
+
+        Raises:
+            InputError: If the network has no layer for it.
+        """
+        if self.scatter is None:
+            raise InputError("This network does not tell how far it may be off: train an ensemble.")
+        x = self._hidden(inputs, rngs)
+        # Bounded, so that no step of the training can make it overflow.
+        exponent = _LARGEST_EXPONENT * jnp.tanh(self.scatter(x) / _LARGEST_EXPONENT)
+        return self._restored(self.output(x)), _USUAL_VARIANCE * jnp.exp(exponent)
+
+    def _hidden(self, inputs: Array, rngs: nnx.Rngs | None) -> Array:
         x = inputs if self.scale_in is None else self.scale_in.standardise(inputs)
         for layer in self.hidden:
             x = ACTIVATIONS[self.activation](layer(x))
             x = self.dropout(x, deterministic=rngs is None, rngs=rngs)
-        out = self.output(x)
-        return out if self.scale_out is None else self.scale_out.restore(out)
+        return x
+
+    def _restored(self, outputs: Array) -> Array:
+        return outputs if self.scale_out is None else self.scale_out.restore(outputs)
 
     def in_spreads(self, errors: Float[Array, "*batch m"]) -> Float[Array, "*batch m"]:
         """Errors of the outputs in units of their spread."""
         return errors if self.scale_out is None else self.scale_out.in_spreads(errors)
+
+    def of_spreads(self, errors: Float[Array, "*batch m"]) -> Float[Array, "*batch m"]:
+        """The inverse of `in_spreads`."""
+        return errors if self.scale_out is None else self.scale_out.of_spreads(errors)
 
 
 def check_activation(name: str) -> None:

@@ -36,6 +36,7 @@ class PsiLow(Mlp):
         activation: Name of the activation function, one of `wlplan.models.layers.ACTIVATIONS`.
         dropout: Part of the hidden units that is dropped in training.
         standardised: False: without the scalings of `Mlp`, as the first models were.
+        scattered: Whether it also tells how far it may be off, as members of an ensemble do.
         rngs: Random streams of the initial weights.
 
     Raises:
@@ -49,6 +50,7 @@ class PsiLow(Mlp):
         activation: str = "swish",
         dropout: float = 0.1,
         standardised: bool = True,
+        scattered: bool = False,
         rngs: nnx.Rngs,
     ):
         super().__init__(
@@ -58,6 +60,7 @@ class PsiLow(Mlp):
             activation=activation,
             dropout=dropout,
             standardised=standardised,
+            scattered=scattered,
             rngs=rngs,
         )
 
@@ -84,6 +87,21 @@ def bounded_performance(normalised: Float[Array, "3"], outputs: Normaliser) -> P
     return Performance(mass=positive[0], time=positive[1], work=positive[2])
 
 
+def performance_and_variance(
+    head: Mlp, inputs: Float[Array, " k"], outputs: Normaliser
+) -> tuple[Performance, Performance]:
+    """The performance that a network means, and the variance of what it may be off.
+
+    Args:
+        head: The network, or its last part.
+        inputs: What it is given.
+        outputs: Range of mass [tonne], time [s] and work [kJ] in the training data.
+    """
+    normalised, variances = head.outputs_and_variances(inputs)
+    off = outputs.span * head.of_spreads(jnp.sqrt(variances))
+    return bounded_performance(normalised, outputs), Performance(*(off**2))
+
+
 @no_type_check
 class PerformanceModel(struct.PyTreeNode):
     """A trained ψ_low. A pytree: the weights and the normalisers are leaves.
@@ -104,6 +122,21 @@ class PerformanceModel(struct.PyTreeNode):
         Inputs are held near the range of the training data, see `soft_clamp`, outputs to what is
         possible, see `bounded_performance`.
         """
-        raw = jnp.concatenate([jnp.asarray(characteristics), jnp.asarray(action)])
-        inputs = soft_clamp(self.inputs.normalise(raw))
+        inputs = self._normalised(characteristics, action)
         return bounded_performance(nnx.merge(self.graph, self.params)(inputs), self.outputs)
+
+    def with_variance(
+        self, characteristics: Float[Array, "4"], action: Float[Array, "4"]
+    ) -> tuple[Performance, Performance]:
+        """The performance, and the variance of what it may be off [tonne², s², kJ²].
+
+        Raises:
+            InputError: If the network was not trained to tell, see `Mlp.outputs_and_variances`.
+        """
+        network = nnx.merge(self.graph, self.params)
+        inputs = self._normalised(characteristics, action)
+        return performance_and_variance(network, inputs, self.outputs)
+
+    def _normalised(self, characteristics: Array, action: Array) -> Array:
+        raw = jnp.concatenate([jnp.asarray(characteristics), jnp.asarray(action)])
+        return soft_clamp(self.inputs.normalise(raw))

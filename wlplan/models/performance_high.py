@@ -27,7 +27,12 @@ from wlplan.models.layers import (
     soft_clamp,
 )
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.performance import INPUTS, OUTPUTS, bounded_performance
+from wlplan.models.performance import (
+    INPUTS,
+    OUTPUTS,
+    bounded_performance,
+    performance_and_variance,
+)
 from wlplan.types import LocalHeightmap, Performance
 
 ENCODERS = ("convolutional", "principal")
@@ -98,6 +103,7 @@ class PsiHigh(nnx.Module):
             characteristics.
         activation: Name of the activation function, one of `wlplan.models.layers.ACTIVATIONS`.
         dropout: Part of the hidden units that is dropped in training.
+        scattered: Whether it also tells how far it may be off, as members of an ensemble do.
         rngs: Random streams of the initial weights.
 
     Raises:
@@ -111,6 +117,7 @@ class PsiHigh(nnx.Module):
         encoder: str = "convolutional",
         activation: str = "swish",
         dropout: float = 0.1,
+        scattered: bool = False,
         rngs: nnx.Rngs,
     ):
         if encoder not in ENCODERS:
@@ -123,7 +130,15 @@ class PsiHigh(nnx.Module):
             else PrincipalComponents()
         )
         inputs = _CODE + 4 if convolutional else _COMPONENTS + INPUTS
-        self.head = Mlp(inputs, OUTPUTS, hidden, activation=activation, dropout=dropout, rngs=rngs)
+        self.head = Mlp(
+            inputs,
+            OUTPUTS,
+            hidden,
+            activation=activation,
+            dropout=dropout,
+            scattered=scattered,
+            rngs=rngs,
+        )
 
     def __call__(
         self,
@@ -197,17 +212,30 @@ class HighPerformanceModel(struct.PyTreeNode):
         Raises:
             InputError: If the map has another number of cells.
         """
+        network = nnx.merge(self.graph, self.params)
+        return bounded_performance(network(*self._normalised(local, action)), self.outputs)
+
+    def with_variance(
+        self, local: LocalHeightmap, action: Float[Array, "4"]
+    ) -> tuple[Performance, Performance]:
+        """The performance, and the variance of what it may be off [tonne², s², kJ²].
+
+        Raises:
+            InputError: If the map has another number of cells, or the network was not trained to
+                tell, see `Mlp.outputs_and_variances`.
+        """
+        network = nnx.merge(self.graph, self.params)
+        features = network.features(*self._normalised(local, action))
+        return performance_and_variance(network.head, features, self.outputs)
+
+    def _normalised(self, local: LocalHeightmap, action: Array) -> tuple[Array, Array]:
         if local.height.shape != (PERFORMANCE_CELLS, PERFORMANCE_CELLS):
             raise InputError(
                 f"The local heightmap has {local.height.shape} cells; ψ_high was trained on "
                 f"{PERFORMANCE_CELLS} a side: sample it with cells={PERFORMANCE_CELLS}."
             )
         raw = jnp.concatenate([as_vector(characteristics(local)), jnp.asarray(action)])
-        network = nnx.merge(self.graph, self.params)
-        return bounded_performance(
-            network(
-                soft_clamp((local.height - self.maps.low[0]) / self.maps.span[0]),
-                soft_clamp(self.inputs.normalise(raw)),
-            ),
-            self.outputs,
+        return (
+            soft_clamp((local.height - self.maps.low[0]) / self.maps.span[0]),
+            soft_clamp(self.inputs.normalise(raw)),
         )

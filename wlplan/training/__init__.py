@@ -6,6 +6,7 @@ was cut short goes on where it stopped and ends with the same weights.
 """
 
 from wlplan.training.evaluation import Errors, EvaluationReport, evaluate_performance
+from wlplan.training.fitting import LOSSES
 from wlplan.training.performance import held_out, train_psi_high, train_psi_low
 from wlplan.training.pile_state import (
     PileStateErrors,
@@ -14,8 +15,10 @@ from wlplan.training.pile_state import (
     train_phi_vae,
 )
 from wlplan.training.storage import MODEL_FORMAT, load_model, read_description, save_model
+from wlplan.training.weights import train_all
 
 __all__ = [
+    "LOSSES",
     "MODEL_FORMAT",
     "Errors",
     "EvaluationReport",
@@ -26,6 +29,7 @@ __all__ = [
     "load_model",
     "read_description",
     "save_model",
+    "train_all",
     "train_phi",
     "train_phi_vae",
     "train_psi_high",

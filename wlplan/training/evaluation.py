@@ -8,14 +8,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from wlplan.dataset import Dataset
 from wlplan.errors import InputError
+from wlplan.models.ensemble import PERCENT_90, Ensemble
 from wlplan.models.performance import PerformanceModel
 from wlplan.models.performance_high import HighPerformanceModel
 from wlplan.types import LocalHeightmap, Performance
 from wlplan.units import CELL_SIZE
+
+QUANTITIES = ("mass", "time", "work")
+"""What a loading yields and costs [tonne, s, kJ]."""
 
 # Load from which an error relative to it says something [tonne]: a sixth of a full bucket. Of a
 # bucket that comes out nearly empty any error is many times the load.
@@ -38,20 +42,36 @@ class Errors:
 
 
 @dataclasses.dataclass(frozen=True)
+class Interval:
+    """How the errors of an ensemble in one quantity agree with what it tells about them."""
+
+    # Part of the cycles inside the interval that ought to hold 0.9 of them [1].
+    coverage: float
+    # The same of fifths of the cycles, from the least deviation that is told to the largest.
+    coverage_by_fifths: list[float]
+    # Root mean square of the deviations that are told, and of the errors, of each fifth.
+    deviation_by_fifths: list[float]
+    error_by_fifths: list[float]
+
+
+@dataclasses.dataclass(frozen=True)
 class EvaluationReport:
     """How a performance predictor does on cycles that it has not seen."""
 
     loaded_mass: float  # load from which a cycle counts as loaded [tonne]
     loaded: Errors  # over cycles with at least that load
     every: Errors  # over all valid cycles
+    # Of an ensemble, over all valid cycles: mass [tonne], time [s], work [kJ].
+    intervals: dict[str, Interval] | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """The report as JSON has it."""
-        return dataclasses.asdict(self)
+        """The report as JSON has it; without intervals where there are none."""
+        record = dataclasses.asdict(self)
+        return record if self.intervals else {k: v for k, v in record.items() if k != "intervals"}
 
 
 def evaluate_performance(
-    model: PerformanceModel | HighPerformanceModel, dataset: Dataset
+    model: PerformanceModel | HighPerformanceModel | Ensemble, dataset: Dataset
 ) -> EvaluationReport:
     """Compares a model with the simulated cycles of a data set, or of a part of one.
 
@@ -67,8 +87,8 @@ def evaluate_performance(
         raise InputError(
             f"No cycle has a load of {_LOADED:g} t or more: there is nothing to evaluate on."
         )
-    predicted = predict(model, dataset)
-    by_name = {name: np.asarray(getattr(predicted, name)) for name in ("mass", "time", "work")}
+    predicted, deviation = _predicted(model, dataset)
+    by_name = {name: np.asarray(getattr(predicted, name)) for name in QUANTITIES}
 
     def errors(which: np.ndarray) -> Errors:
         parts: dict[str, list[float]] = {"relative": [], "absolute": [], "total": []}
@@ -83,27 +103,73 @@ def evaluate_performance(
         named = {key: dict(zip(by_name, values, strict=True)) for key, values in parts.items()}
         return Errors(int(which.sum()), named["relative"], named["absolute"], named["total"])
 
-    return EvaluationReport(_LOADED, errors(loaded), errors(np.ones_like(loaded)))
+    intervals = None
+    if deviation is not None:
+        intervals = {
+            name: _interval(values - getattr(dataset, name), np.asarray(getattr(deviation, name)))
+            for name, values in by_name.items()
+        }
+    return EvaluationReport(_LOADED, errors(loaded), errors(np.ones_like(loaded)), intervals)
 
 
-def predict(model: PerformanceModel | HighPerformanceModel, dataset: Dataset) -> Performance:
-    """The performance that a model predicts for each cycle; leaves of shape [n]."""
-    if isinstance(model, PerformanceModel):
-        return _predict_low(
-            model, jnp.asarray(dataset.characteristics), jnp.asarray(dataset.action)
-        )
-    return _predict_high(model, jnp.asarray(dataset.h36), jnp.asarray(dataset.action))
+def _interval(error: Float[np.ndarray, " n"], deviation: Float[np.ndarray, " n"]) -> Interval:
+    """Agreement of errors with their standard deviations."""
+    inside = np.abs(error) <= PERCENT_90 * deviation
+    fifths = [part for part in np.array_split(np.argsort(deviation), 5) if len(part)]
 
+    def sizes(values: np.ndarray) -> list[float]:
+        return [float(np.sqrt(np.mean(values[part].astype(np.float64) ** 2))) for part in fifths]
 
-@jax.jit
-def _predict_low(model: PerformanceModel, characteristics: Array, action: Array) -> Performance:
-    return jax.vmap(model)(characteristics, action)
-
-
-@jax.jit
-def _predict_high(model: HighPerformanceModel, maps: Array, action: Array) -> Performance:
-    return jax.lax.map(
-        lambda cycle: model(LocalHeightmap(cycle[0], CELL_SIZE, 0.0), cycle[1]),
-        (maps, action),
-        batch_size=_CHUNK,
+    return Interval(
+        float(inside.mean()),
+        [float(inside[part].mean()) for part in fifths],
+        sizes(deviation),
+        sizes(error),
     )
+
+
+def widening(ensemble: Ensemble, dataset: Dataset) -> Float[Array, "3"]:
+    """Factors by which an ensemble has to widen its deviations of mass, time and work.
+
+    With them nine in ten cycles lie within `PERCENT_90` deviations of the prediction.
+
+    Args:
+        ensemble: Ensemble whose own factors are one.
+        dataset: Cycles that its members were not trained on.
+    """
+    predicted, deviation = _predicted(ensemble, dataset)
+    assert deviation is not None
+    factors = []
+    for name in QUANTITIES:
+        error = np.abs(np.asarray(getattr(predicted, name)) - getattr(dataset, name))
+        ratios = error / np.asarray(getattr(deviation, name))
+        factors.append(np.quantile(ratios, 0.9) / PERCENT_90)
+    return jnp.asarray(np.array(factors, np.float32))
+
+
+def predict(
+    model: PerformanceModel | HighPerformanceModel | Ensemble, dataset: Dataset
+) -> Performance:
+    """The performance that a model predicts for each cycle; leaves of shape [n]."""
+    return _predicted(model, dataset)[0]
+
+
+def _predicted(
+    model: PerformanceModel | HighPerformanceModel | Ensemble, dataset: Dataset
+) -> tuple[Performance, Performance | None]:
+    """Prediction of each cycle and, by an ensemble, its standard deviation."""
+    network = model.members if isinstance(model, Ensemble) else model
+    if isinstance(network, PerformanceModel):
+        return _of_views(model, jnp.asarray(dataset.characteristics), jnp.asarray(dataset.action))
+    return _of_views(model, jnp.asarray(dataset.h36), jnp.asarray(dataset.action))
+
+
+@jax.jit
+def _of_views(model: Any, views: Array, action: Array) -> tuple[Performance, Performance | None]:
+    def one(cycle: tuple[Array, Array]) -> tuple[Performance, Performance | None]:
+        view = cycle[0] if cycle[0].ndim == 1 else LocalHeightmap(cycle[0], CELL_SIZE, 0.0)
+        if isinstance(model, Ensemble):
+            return model.with_deviation(view, cycle[1])
+        return model(view, cycle[1]), None
+
+    return jax.lax.map(one, (views, action), batch_size=_CHUNK)

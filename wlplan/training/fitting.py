@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 from wlplan.errors import InputError
 from wlplan.io.files import write_bytes_atomic
@@ -34,6 +34,14 @@ _CHUNK = 256
 # Least time between two saved states [s].
 _SAVE_EVERY = 30.0
 
+LOSSES = ("huber", "squared")
+"""What counts of an error: up to a fifth of the spread its square, beyond that its size; or always
+its square, as in the paper. Three cycles in a hundred stall and take far longer than the rest. They
+weigh so much by the square that all others suffer: ψ_low errs by 6.0 % in time; by Huber's 3.3 %.
+"""
+# Error from which on the size counts, in units of the spread.
+_HUBER = 0.2
+
 Loss = Callable[[Any, PyTree, nnx.Rngs | None], Array]
 """Mean loss of a network over examples; without random streams, as in use and not in training."""
 
@@ -46,7 +54,9 @@ class Recipe:
     batch: int  # examples a step; at most those there are
     learning_rate: float  # at its peak
     weight_decay: float = 1e-2
-    seed: int = 0  # of the order of the examples and the dropout
+    seed: int = 0  # of the initial weights, the order of the examples and the dropout
+    members: int = 1  # networks that are fitted side by side
+    loss: str = "squared"  # one of LOSSES
 
     def __post_init__(self) -> None:
         if self.epochs < 1 or self.batch < 1:
@@ -54,6 +64,16 @@ class Recipe:
                 f"{self.epochs} epochs of batches of {self.batch} asked for: both have to be at "
                 f"least 1."
             )
+        if self.members < 1:
+            raise InputError(f"{self.members} members asked for: there has to be at least 1.")
+        if self.loss not in LOSSES:
+            raise InputError(f"Unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}.")
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seed of each member; that of the first is the recipe's own."""
+        others = np.random.SeedSequence(self.seed).generate_state(self.members - 1)
+        return [self.seed, *(int(number) >> 1 for number in others)]
 
     def as_dict(self) -> dict[str, Any]:
         """The recipe as `model.json` has it."""
@@ -121,8 +141,26 @@ class SavedState:
         self._path.unlink(missing_ok=True)
 
 
+def of_errors(errors: Float[Array, "*n"], loss: str) -> Float[Array, "*n"]:
+    """What each error counts, see `LOSSES`.
+
+    Args:
+        errors: Errors in units of the spread.
+        loss: One of `LOSSES`. The smooth form of Huber's loss, and squares on its scale.
+    """
+    if loss == "squared":
+        return errors**2
+    return jnp.sqrt(errors**2 + _HUBER**2) - _HUBER
+
+
+def mirror_some(key: Array, maps: Float[Array, "n i j"]) -> tuple[Array, Bool[Array, " n"]]:
+    """Maps of which about half are mirrored, left for right, and which ones."""
+    mirrored = jax.random.bernoulli(key, 0.5, (len(maps),))
+    return jnp.where(mirrored[:, None, None], maps[:, :, ::-1], maps), mirrored
+
+
 def fitted(
-    network: nnx.Module,
+    networks: nnx.Module | list[nnx.Module],
     loss: Loss,
     train: PyTree,
     validation: PyTree,
@@ -132,10 +170,14 @@ def fitted(
     state: SavedState | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Any, dict[str, Any]]:
-    """Fits a network to examples.
+    """Fits a network to examples, or the members of an ensemble side by side.
+
+    Members see the same examples, each in its own order. Under `vmap` they take as much processor
+    time as one after the other (two cores, ψ_low of 512 units twice: 1.77 s an epoch of five), and
+    are compiled once.
 
     Args:
-        network: Network to start from.
+        networks: Network to start from, or those of all members.
         loss: Loss to reduce.
         train: Examples, leaves with one leading axis.
         validation: Examples that choose among the epochs.
@@ -145,12 +187,14 @@ def fitted(
         progress: Called with the number of epochs done and in all.
 
     Returns:
-        The state of the network with the least validation loss, and a record of the training.
+        The state with the least validation loss, of members stacked, and a record of the training.
 
     Raises:
         InputError: If the training diverges.
     """
-    graph, params, rest = _split(network)
+    seeds = recipe.seeds if isinstance(networks, list) else [recipe.seed]
+    parts = [_split(n) for n in (networks if isinstance(networks, list) else [networks])]
+    graph = parts[0][0]
     count = len(jax.tree.leaves(train)[0])
     batch = min(recipe.batch, count)
     steps = recipe.epochs * (count // batch)
@@ -161,32 +205,42 @@ def fitted(
         optax.clip_by_global_norm(_LARGEST_GRADIENT),
         optax.adamw(rate, weight_decay=recipe.weight_decay),
     )
-    run_epoch = jax.jit(partial(_epoch, graph, loss, optimiser, batch, augment))
-    infinite = jnp.asarray(jnp.inf, jax.tree.leaves(params)[0].dtype)
-    fit = Fit(params, rest, optimiser.init(params), (params, rest), infinite, jnp.asarray(0))
-    losses: Any = np.full(2, np.inf)
+    run_epoch: Any = partial(_epoch, graph, loss, optimiser, batch, augment)
+
+    def start(params: Any, rest: Any) -> Fit:
+        infinite = jnp.asarray(jnp.inf, jax.tree.leaves(params)[0].dtype)
+        return Fit(params, rest, optimiser.init(params), (params, rest), infinite, jnp.asarray(0))
+
+    fit: Any = [start(params, rest) for _, params, rest in parts]
+    keys: Any = [jax.random.key(seed) for seed in seeds]
+    if isinstance(networks, list):
+        run_epoch = jax.vmap(run_epoch, in_axes=(0, 0, None, None, None))
+        fit, keys = jax.tree.map(lambda *leaves: jnp.stack(leaves), *fit), jnp.stack(keys)
+    else:
+        fit, keys = fit[0], keys[0]
+    run_epoch = jax.jit(run_epoch)
+    losses: Any = np.full((*keys.shape, 2), np.inf)
     done = 0
     if state is not None and (found := state.load(fit)) is not None:
         fit, done, losses = found
     while done < recipe.epochs:
-        key = jax.random.fold_in(jax.random.key(recipe.seed), done)
-        fit, losses = run_epoch(fit, key, jnp.asarray(done), train, validation)
+        fit, losses = run_epoch(fit, keys, jnp.asarray(done), train, validation)
         done += 1
         if state is not None:
             state.save(fit, done, losses, now=done == recipe.epochs)
         if progress is not None:
             jax.block_until_ready(losses)
             progress(done, recipe.epochs)
-    training_loss, validation_loss = (float(loss) for loss in losses)
-    if not np.isfinite(float(fit.best_loss)):
+    if not np.isfinite(fit.best_loss).all():
         raise InputError("The training diverged: use a smaller learning rate.")
     record = {
         **recipe.as_dict(),
         "batch": batch,
-        "best_epoch": int(fit.best_epoch) + 1,
-        "best_validation_loss": float(fit.best_loss),
-        "last_training_loss": training_loss,
-        "last_validation_loss": validation_loss,
+        # Numbers, or lists of them: one for each member.
+        "best_epoch": (np.asarray(fit.best_epoch) + 1).tolist(),
+        "best_validation_loss": np.asarray(fit.best_loss, float).tolist(),
+        "last_training_loss": np.asarray(losses[..., 0], float).tolist(),
+        "last_validation_loss": np.asarray(losses[..., 1], float).tolist(),
     }
     return nnx.merge_state(*fit.best), record
 
@@ -204,7 +258,7 @@ def _epoch(
     validation: PyTree,
 ) -> tuple[Fit, Array]:
     """One pass over the shuffled examples; the fit, and training and validation loss."""
-    order_key, step_key = jax.random.split(key)
+    order_key, step_key = jax.random.split(jax.random.fold_in(key, number))
     count = len(jax.tree.leaves(train)[0])
     steps = count // batch
     # What does not fill a batch is left out, of each epoch another part.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -14,18 +13,16 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
-from wlplan.dataset import Dataset, fingerprint, split, versions
+from wlplan.dataset import Dataset
 from wlplan.errors import InputError
 from wlplan.heightmap import STATE_DISPLACEMENT
 from wlplan.models.height_change import HeightChange, HeightChangeModel
 from wlplan.models.pile_state import Phi, PileStateModel, scaled
-from wlplan.training.fitting import Recipe, SavedState, fitted
-from wlplan.training.storage import architecture, check_target, save_model
+from wlplan.training.fitting import Recipe, mirror_some
+from wlplan.training.session import Session
 from wlplan.types import LocalHeightmap, PyTree
 from wlplan.units import CELL_SIZE, KG_PER_TONNE
 
-# Training, validation and test. Paper, section 6.4.2.
-_FRACTIONS = (0.8, 0.1, 0.1)
 # Density where a data set does not name its soil [kg/m³]: gravel. Paper, table of the simulator.
 _DENSITY = 1727.0
 # Weight of the divergence beside the squared error. Paper, section 6.4.2. We read both as sums,
@@ -103,7 +100,7 @@ def _predict(model: Any, before: Array, known: Array, blend: bool) -> Array:
 
 
 def train_phi(
-    dataset: Dataset,
+    dataset: Dataset | Sequence[Dataset],
     *,
     out: str | os.PathLike[str] | None = None,
     seed: int = 0,
@@ -120,7 +117,7 @@ def train_phi(
     Split, choice of the weights, mirrored maps and resuming are as for `train_psi_high`.
 
     Args:
-        dataset: Loading cycles; those that are not valid are left out.
+        dataset: Loading cycles, of one or several data sets; those that are not valid are left out.
         out: Directory to save to; an older model there is replaced. None: nothing is saved.
         seed: Seed of everything random but the split.
         epochs: Passes over the training part.
@@ -139,16 +136,12 @@ def train_phi(
             model cannot be saved.
     """
     recipe = Recipe(epochs, batch, learning_rate, seed=seed)
-    parts = _parts(dataset, out)
+    session = Session(dataset, out, recipe, _tables)
     network = HeightChange(hidden, activation=activation, dropout=dropout, rngs=nnx.Rngs(seed))
-    maps, changes = (
-        [jnp.asarray(v) for v in values]
-        for values in (
-            [part.h52 for part in parts[:2]],
-            [part.h52_after - part.h52 for part in parts[:2]],
-        )
+    maps, changes, known = (
+        [jnp.asarray(table[name]) for table in session.tables[:2]]
+        for name in ("maps", "changes", "known")
     )
-    known = [jnp.asarray(_known(part)) for part in parts[:2]]
     network.fit_scales(maps[0], changes[0], known[0])
     examples = [
         {
@@ -166,33 +159,18 @@ def train_phi(
         error = network(e["maps"], e["known"], rngs=rngs) - e["weights"]
         return jnp.mean(jnp.sum((error / spread) ** 2, axis=-1))
 
-    def mirror_some(key: Array, e: PyTree) -> PyTree:
-        mirrored = jax.random.bernoulli(key, 0.5, (len(e["maps"]), 1, 1))
-        return {
-            **e,
-            "maps": jnp.where(mirrored, e["maps"][:, :, ::-1], e["maps"]),
-            "weights": jnp.where(mirrored[:, :, 0], e["mirrored"], e["weights"]),
-        }
+    def mirror(key: Array, e: PyTree) -> PyTree:
+        maps, mirrored = mirror_some(key, e["maps"])
+        weights = jnp.where(mirrored[:, None], e["mirrored"], e["weights"])
+        return {**e, "maps": maps, "weights": weights}
 
-    state = _state(dataset, out, "fit", recipe, network)
-    best, record = fitted(
-        network,
-        loss,
-        examples[0],
-        examples[1],
-        recipe,
-        augment=mirror_some,
-        state=state,
-        progress=progress,
-    )
+    best = session.fit(network, loss, examples, augment=mirror, progress=progress)
     model = HeightChangeModel(best, nnx.graphdef(network))
-    errors = evaluate_pile_state(model, parts[2])
-    _save(dataset, out, model, {**record, "cycles": [len(p) for p in parts]}, errors, [state])
-    return model, errors
+    return model, session.finish(model, evaluate_pile_state)
 
 
 def train_phi_vae(
-    dataset: Dataset,
+    dataset: Dataset | Sequence[Dataset],
     *,
     out: str | os.PathLike[str] | None = None,
     seed: int = 0,
@@ -214,11 +192,11 @@ def train_phi_vae(
         InputError: As for `train_phi`.
     """
     recipe = Recipe(epochs, batch, learning_rate, seed=seed)
-    parts = _parts(dataset, out)
+    session = Session(dataset, out, recipe, _tables)
     phi = Phi(hidden, dropout=dropout, rngs=nnx.Rngs(seed))
-    mean = parts[0].h52.mean(axis=0)
+    mean = session.tables[0]["maps"].mean(axis=0)
     phi.mean[...] = jnp.asarray((mean + mean[:, ::-1]) / 2.0)
-    pairs = [_scaled_pairs(part, phi.mean[...]) for part in parts[:2]]
+    pairs = [_scaled_pairs(table, phi.mean[...]) for table in session.tables[:2]]
 
     def reconstruction(vae: Any, e: PyTree, rngs: nnx.Rngs | None) -> Array:
         code, log_variance = vae.encode(e["maps"])
@@ -228,62 +206,63 @@ def train_phi_vae(
         squared = ((vae.decode(code) - e["maps"]) ** 2).sum(axis=(1, 2))
         return jnp.mean(squared + _DIVERGENCE * divergence)
 
-    def mirror_some(key: Array, e: PyTree) -> PyTree:
-        mirrored = jax.random.bernoulli(key, 0.5, (len(e["maps"]), 1, 1))
-        return {**e, "maps": jnp.where(mirrored, e["maps"][:, :, ::-1], e["maps"])}
-
     def told(offset: int) -> Callable[[int, int], None] | None:
         return None if progress is None else lambda done, _: progress(offset + done, 2 * epochs)
 
-    states = [_state(dataset, out, stage, recipe, phi) for stage in ("vae", "step")]
-    # Every map is scaled by its own range here.
-    own = [{"maps": jnp.concatenate([pair["before"], pair["after_own"]])} for pair in pairs]
-    best, first = fitted(
+    best = session.fit(
         phi.vae,
         reconstruction,
-        own[0],
-        own[1],
-        recipe,
-        augment=mirror_some,
-        state=states[0],
+        # Every map is scaled by its own range here.
+        [{"maps": jnp.concatenate([pair["before"], pair["after_own"]])} for pair in pairs],
+        stage="vae",
+        whole=phi,
+        augment=lambda key, e: {**e, "maps": mirror_some(key, e["maps"])[0]},
         progress=told(0),
     )
     nnx.update(phi.vae, best)
 
-    encode = jax.jit(lambda maps: jax.lax.map(lambda m: phi.vae.encode(m)[0], maps, batch_size=128))
-    # Of each pair also the mirror image, half and half.
-    codes = []
-    for pair, part in zip(pairs, parts[:2], strict=True):
-        known = jnp.concatenate([jnp.asarray(part.action), pair["span"][:, None]], axis=1)
-        inputs, outputs = [], []
-        for side in (1, -1):
-            z, after = (encode(pair[name][:, :, ::side]) for name in ("before", "after"))
-            inputs.append(jnp.concatenate([z, known], axis=1))
-            outputs.append(after)
-        codes.append({"inputs": jnp.concatenate(inputs), "outputs": jnp.concatenate(outputs)})
+    codes = [
+        _codes(phi, table, pair) for table, pair in zip(session.tables[:2], pairs, strict=True)
+    ]
     assert phi.step.scale_in is not None
     assert phi.step.scale_out is not None
     phi.step.scale_in.fit(codes[0]["inputs"])
     phi.step.scale_out.fit(codes[0]["outputs"])
-    best, second = fitted(
+    best = session.fit(
         phi.step,
         lambda step, e, rngs: jnp.mean((step(e["inputs"], rngs=rngs) - e["outputs"]) ** 2),
-        codes[0],
-        codes[1],
-        recipe,
-        state=states[1],
+        codes,
+        stage="step",
+        whole=phi,
         progress=told(epochs),
     )
     nnx.update(phi.step, best)
     graph, params = nnx.split(phi)
     model = PileStateModel(params, graph)
-    errors = evaluate_pile_state(model, parts[2])
-    record = {"vae": first, "step": second, "cycles": [len(p) for p in parts]}
-    _save(dataset, out, model, record, errors, states)
-    return model, errors
+    return model, session.finish(model, evaluate_pile_state)
 
 
-def _scaled_pairs(dataset: Dataset, mean: Array) -> dict[str, Array]:
+def _tables(dataset: Dataset) -> dict[str, np.ndarray]:
+    changes = dataset.h52_after - dataset.h52
+    return {"maps": dataset.h52, "changes": changes, "known": _known(dataset)}
+
+
+def _codes(
+    phi: Phi, table: Mapping[str, np.ndarray], pair: dict[str, Array]
+) -> dict[str, Float[Array, "n k"]]:
+    """Inputs and outputs of the step between codes; of each pair also the mirror image."""
+    encode = jax.jit(lambda maps: jax.lax.map(lambda m: phi.vae.encode(m)[0], maps, batch_size=128))
+    action = jnp.asarray(table["known"][:, :4])
+    known = jnp.concatenate([action, pair["span"][:, None]], axis=1)
+    inputs, outputs = [], []
+    for side in (1, -1):
+        z, after = (encode(pair[name][:, :, ::side]) for name in ("before", "after"))
+        inputs.append(jnp.concatenate([z, known], axis=1))
+        outputs.append(after)
+    return {"inputs": jnp.concatenate(inputs), "outputs": jnp.concatenate(outputs)}
+
+
+def _scaled_pairs(table: Mapping[str, np.ndarray], mean: Array) -> dict[str, Array]:
     """Scaled maps before and after; the latter by the scale of the former and by their own."""
 
     @jax.jit
@@ -296,7 +275,8 @@ def _scaled_pairs(dataset: Dataset, mean: Array) -> dict[str, Array]:
             "span": span,
         }
 
-    return jax.vmap(pair)(jnp.asarray(dataset.h52), jnp.asarray(dataset.h52_after))
+    before = jnp.asarray(table["maps"])
+    return jax.vmap(pair)(before, before + jnp.asarray(table["changes"]))
 
 
 def _known(dataset: Dataset) -> Float[np.ndarray, "n 5"]:
@@ -305,57 +285,3 @@ def _known(dataset: Dataset) -> Float[np.ndarray, "n 5"]:
     density = soil.get("density", _DENSITY) if isinstance(soil, dict) else _DENSITY
     volume = dataset.mass * np.float32(KG_PER_TONNE / density)
     return np.concatenate([dataset.action, volume[:, None]], axis=1).astype(np.float32)
-
-
-def _parts(dataset: Dataset, out: str | os.PathLike[str] | None) -> list[Dataset]:
-    if out is not None:
-        check_target(Path(out))
-    parts = [part.select(part.valid) for part in split(dataset, fractions=_FRACTIONS)]
-    if not all(len(part) for part in parts):
-        raise InputError("The data set has too few valid cycles to split: collect more cycles.")
-    tables = [getattr(part, name) for part in parts for name in ("h52", "h52_after", "action")]
-    if not all(np.isfinite(table).all() for table in tables):
-        raise InputError("The data set holds numbers that are not finite: collect it again.")
-    return parts
-
-
-def _state(
-    dataset: Dataset,
-    out: str | os.PathLike[str] | None,
-    stage: str,
-    recipe: Recipe,
-    network: nnx.Module,
-) -> SavedState | None:
-    if out is None:
-        return None
-    place = Path(out).absolute()
-    identity = {
-        "dataset": fingerprint(dataset),
-        "recipe": recipe.as_dict(),
-        "network": type(network).__name__,
-        "architecture": architecture(network),
-        "stage": stage,
-        "versions": versions(),
-    }
-    return SavedState(place.with_name(f".{place.name}.{stage}.training.npz"), identity)
-
-
-def _save(
-    dataset: Dataset,
-    out: str | os.PathLike[str] | None,
-    model: HeightChangeModel | PileStateModel,
-    training: dict[str, Any],
-    errors: PileStateErrors,
-    states: list[SavedState | None],
-) -> None:
-    if out is None:
-        return
-    description = {
-        "training": {**training, "fractions": _FRACTIONS},
-        "dataset": {"fingerprint": fingerprint(dataset), **dataset.attributes},
-        "held_out": errors.as_dict(),
-    }
-    save_model(out, model, description)
-    for state in states:
-        if state is not None:
-            state.remove()

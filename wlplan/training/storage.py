@@ -21,15 +21,32 @@ from flax import nnx
 
 from wlplan.dataset import versions
 from wlplan.errors import InputError
+from wlplan.heightmap import (
+    PERFORMANCE_CELLS,
+    PERFORMANCE_DISPLACEMENT,
+    STATE_CELLS,
+    STATE_DISPLACEMENT,
+)
+from wlplan.models.ensemble import Ensemble
 from wlplan.models.height_change import HeightChange, HeightChangeModel
 from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel, PsiLow
 from wlplan.models.performance_high import HighPerformanceModel, PsiHigh
 from wlplan.models.pile_state import Phi, PileStateModel
+from wlplan.units import CELL_SIZE
 
 MODEL_FORMAT = "wlplan.model/1"
 
-Model = PerformanceModel | HighPerformanceModel | HeightChangeModel | PileStateModel
+Model = PerformanceModel | HighPerformanceModel | HeightChangeModel | PileStateModel | Ensemble
+
+GRID: dict[str, float] = {
+    "cell_size": CELL_SIZE,
+    "performance_cells": PERFORMANCE_CELLS,
+    "performance_displacement": PERFORMANCE_DISPLACEMENT,
+    "state_cells": STATE_CELLS,
+    "state_displacement": STATE_DISPLACEMENT,
+}
+"""The local maps that the models look at: spacing [m], cells a side, displacement [m]."""
 
 _DESCRIPTION, _WEIGHTS = "model.json", "weights"
 
@@ -44,12 +61,18 @@ _KINDS: dict[str, tuple[Any, Any, dict[str, int]]] = {
 
 def kind_of(model: Model) -> str:
     """The name under which a model is saved."""
-    return next(kind for kind, (made, _, _) in _KINDS.items() if isinstance(model, made))
+    made = type(model.members if isinstance(model, Ensemble) else model)
+    return next(kind for kind, (known, _, _) in _KINDS.items() if known is made)
+
+
+def kind_of_network(network: Any) -> str:
+    """The name under which the model of a network is saved."""
+    return next(kind for kind, (_, made, _) in _KINDS.items() if isinstance(network, made))
 
 
 def architecture(network: Any) -> dict[str, Any]:
     """What a network has to be built with anew."""
-    kind = next(name for name, (_, made, _) in _KINDS.items() if isinstance(network, made))
+    kind = kind_of_network(network)
     parts = {"psi_high": "head", "phi": "weights", "phi_vae": "step"}
     perceptron = getattr(network, parts[kind]) if kind in parts else network
     record = {
@@ -62,6 +85,8 @@ def architecture(network: Any) -> dict[str, Any]:
         record["standardised"] = network.scale_in is not None
     if kind == "psi_high":
         record["encoder"] = network.encoder_name
+    if kind in ("psi_low", "psi_high"):
+        record["scattered"] = perceptron.scatter is not None
     return record
 
 
@@ -89,9 +114,10 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
     directory = Path(directory)
     check_target(directory)
     kind = kind_of(model)
-    network = nnx.merge(model.graph, model.params)
+    member: Any = model.members if isinstance(model, Ensemble) else model
+    network = nnx.merge(member.graph, member.params)
     # Arrays of the host: the checkpoint then holds no devices, and loads on any.
-    weights = jax.tree.map(np.asarray, nnx.to_pure_dict(model.params))
+    weights = jax.tree.map(np.asarray, nnx.to_pure_dict(member.params))
     token = secrets.token_hex(4)
     beside = directory.with_name(f".{directory.name}.{token}.tmp").absolute()
     old = directory.with_name(f".{directory.name}.{token}.old")
@@ -108,8 +134,10 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
                 "kind": kind,
                 "architecture": architecture(network),
                 "normaliser": {
-                    name: _normaliser_to_dict(getattr(model, name)) for name in _KINDS[kind][2]
+                    name: _normaliser_to_dict(getattr(member, name)) for name in _KINDS[kind][2]
                 },
+                "grid": GRID,
+                **({"ensemble": _ensemble_to_dict(model)} if isinstance(model, Ensemble) else {}),
                 "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
                 "versions": versions(),
                 **meta,
@@ -141,16 +169,30 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
         directory: Where `save_model` wrote it.
         kind: "psi_low", "psi_high", "phi" (ours) or "phi_vae" (as in the paper).
 
+    Returns:
+        The model; an `Ensemble` if there are several of it.
+
     Raises:
-        InputError: If it is missing, damaged, or of another format or kind.
+        InputError: If it is missing, damaged, of another format or kind, or for another grid.
     """
     import orbax.checkpoint as ocp
 
     directory = Path(directory)
     description = read_description(directory, kind)
+    # Models of before it was recorded do not name their grid; there has been one only.
+    if description.get("grid", GRID) != GRID:
+        raise InputError(
+            f"{directory}: was trained on local maps of another grid than today's "
+            f"({_of_grid(description['grid'])}): train it again."
+        )
     try:
         shape = description["architecture"]
         graph, params = nnx.split(nnx.eval_shape(lambda: _network(kind, shape)))
+        members, factor = _ensemble_of_dict(description.get("ensemble"))
+        if members:
+            params = jax.tree.map(
+                lambda leaf: jax.ShapeDtypeStruct((members, *leaf.shape), leaf.dtype), params
+            )
         normalisers = {
             name: _normaliser_of_dict(description["normaliser"][name], size)
             for name, size in _KINDS[kind][2].items()
@@ -173,7 +215,8 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
         what = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{directory}: is damaged ({what}): copy or train it again.") from error
     nnx.replace_by_pure_dict(params, jax.tree.map(jnp.asarray, weights))
-    return _KINDS[kind][0](params=params, graph=graph, **normalisers)
+    model = _KINDS[kind][0](params=params, graph=graph, **normalisers)
+    return Ensemble(model, factor) if members else model
 
 
 def read_description(
@@ -243,3 +286,24 @@ def _normaliser_of_dict(record: Mapping[str, Any], size: int) -> Normaliser:
     if any(part.shape != (size,) or not np.isfinite(part).all() for part in parts):
         raise ValueError("the normaliser does not fit")
     return Normaliser(*(jnp.asarray(part) for part in parts))
+
+
+def _ensemble_to_dict(ensemble: Ensemble) -> dict[str, Any]:
+    return {"members": ensemble.size, "factor": np.asarray(ensemble.factor).tolist()}
+
+
+def _ensemble_of_dict(record: Mapping[str, Any] | None) -> tuple[int, jax.Array]:
+    """Number of members, 0 of a model that is no ensemble, and their factors."""
+    if record is None:
+        return 0, jnp.ones(3)
+    factor = np.array(record["factor"], np.float32)
+    if record["members"] < 2 or factor.shape != (3,) or not (factor > 0.0).all():
+        raise ValueError("the record of the ensemble makes no sense")
+    return int(record["members"]), jnp.asarray(factor)
+
+
+def _of_grid(record: Any) -> str:
+    """What is different about a grid, in words."""
+    found = record if isinstance(record, dict) else {}
+    wrong = (name for name in GRID if found.get(name) != GRID[name])
+    return ", ".join(f"{name} {found.get(name)}, not {GRID[name]:g}" for name in wrong) or "unknown"

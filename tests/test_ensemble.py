@@ -1,0 +1,260 @@
+"""Laws of ensembles: their mean, their calibrated spread, their place in a world."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import wlplan
+from wlplan.automaton import relax
+from wlplan.dataset import VARIABLES, Dataset
+from wlplan.diggability import edge_poses
+from wlplan.errors import InputError
+from wlplan.models.ensemble import Ensemble
+from wlplan.pile import seed_pile, toe_contour
+from wlplan.training import (
+    evaluate_performance,
+    fitting,
+    held_out,
+    load_model,
+    read_description,
+    train_psi_high,
+    train_psi_low,
+)
+from wlplan.types import LoadingPlan, LocalHeightmap, action_from
+from wlplan.units import ACTION_HIGH
+from wlplan.worlds import HybridWorld, LowWorld
+
+MEMBERS = 5
+LIGHT = {"epochs": 30, "batch": 64, "hidden": (32,), "learning_rate": 1e-2, "members": MEMBERS}
+ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
+
+
+def scatter(slope):
+    """Standard deviation of the mass that no input tells about [tonne]."""
+    return 0.02 + 0.5 * (slope - 0.2)
+
+
+def cycles(rollouts=80, loads=20, seed=0):
+    """Cycles whose mass scatters the more, the steeper the pile."""
+    n = rollouts * loads
+    random = np.random.default_rng(seed)
+    low, high = np.array([0.2, 0.0, -0.2, -0.2]), np.array([0.6, 1.0, 0.3, 0.3])
+    shape = random.uniform(low, high, (n, 4))
+    action = random.uniform(0.0, ACTION_HIGH, (n, 4))
+    mass = 2.0 + 3.0 * shape[:, 0] - action[:, 0] + scatter(shape[:, 0]) * random.normal(size=n)
+    time = 8.0 + 3.0 * action[:, 2] + 0.2 * random.normal(size=n)
+    columns = {name: np.zeros((n, *v.shape), v.dtype) for name, v in VARIABLES.items()}
+    rise = np.arange(36, dtype=np.float32) * 0.1
+    columns |= {
+        "mass": mass.astype(np.float32),
+        "time": time.astype(np.float32),
+        "work": (120.0 * mass + 5.0 * random.normal(size=n)).astype(np.float32),
+        "characteristics": shape.astype(np.float32),
+        "h36": (shape[:, :1, None] * rise[None, :, None] * np.ones((1, 1, 36))).astype(np.float32),
+        "action": action.astype(np.float32),
+        "rollout": np.repeat(np.arange(rollouts, dtype=np.int32), loads),
+        "valid": np.ones(n, bool),
+    }
+    return Dataset(**columns, attributes={})
+
+
+@pytest.fixture(scope="module")
+def data():
+    return cycles()
+
+
+@pytest.fixture(scope="module")
+def saved(data, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("ensemble") / "psi_low"
+    model, report = train_psi_low(data, out=directory, dropout=0.0, **LIGHT)
+    return directory, model, report
+
+
+def flat(performance):
+    return jnp.stack([performance.mass, performance.time, performance.work])
+
+
+def test_nine_in_ten_held_out_cycles_lie_inside_the_interval(saved):
+    report = saved[2]
+    assert set(report.intervals) == {"mass", "time", "work"}
+    for interval in report.intervals.values():
+        assert 0.85 <= interval.coverage <= 0.95
+        assert np.mean(interval.coverage_by_fifths) == pytest.approx(interval.coverage)
+    json.dumps(report.as_dict(), allow_nan=False)
+
+
+def test_the_deviation_is_that_of_the_data_where_they_scatter_much_and_where_little(saved):
+    model = saved[1]
+    view = jnp.array([0.4, 0.5, 0.0, 0.0])
+    told = [float(model.with_deviation(view.at[0].set(s), ACTION)[1].mass) for s in (0.25, 0.55)]
+    true = [scatter(s) for s in (0.25, 0.55)]
+    np.testing.assert_allclose(told, true, rtol=0.35)
+
+
+def test_the_check_of_the_interval_can_fail(saved, data):
+    model = saved[1]
+    narrow = model.replace(factor=0.3 * model.factor)
+    report = evaluate_performance(narrow, held_out(data, read_description(saved[0])))
+    assert all(interval.coverage < 0.6 for interval in report.intervals.values())
+
+
+def test_an_ensemble_is_the_mean_of_its_members_which_differ(saved):
+    model = saved[1]
+    view = jnp.array([0.4, 0.5, 0.0, 0.1])
+    each = []
+    for k in range(model.size):
+        params = jax.tree.map(lambda leaf, k=k: leaf[k], model.members.params)
+        each.append(flat(model.members.replace(params=params)(view, ACTION)))
+    each = np.stack(each)
+    assert len(each) == MEMBERS
+    assert (each.std(axis=0) > 1e-4).all()
+    np.testing.assert_allclose(flat(model(view, ACTION)), each.mean(axis=0), rtol=1e-5)
+    mean, deviation = model.with_deviation(view, ACTION)
+    np.testing.assert_allclose(flat(mean), each.mean(axis=0), rtol=1e-5)
+    assert (flat(deviation) > model.factor * each.std(axis=0)).all()
+
+
+def test_it_errs_less_than_a_member_alone(saved, data):
+    model = saved[1]
+    part = held_out(data, read_description(saved[0]))
+    whole = evaluate_performance(model, part).every.mean_absolute["mass"]
+    alone = []
+    for k in range(model.size):
+        params = jax.tree.map(lambda leaf, k=k: leaf[k], model.members.params)
+        member = model.members.replace(params=params)
+        alone.append(evaluate_performance(member, part).every.mean_absolute["mass"])
+    assert whole < np.mean(alone)
+
+
+def test_the_gradient_of_mean_and_deviation_is_finite_also_far_from_the_data(saved):
+    model = saved[1]
+    for view in (jnp.zeros(4), jnp.array([0.4, 0.5, 0.0, 0.1]), jnp.full(4, 1e4)):
+        slopes = jax.jacrev(
+            lambda v, a: jnp.stack([flat(p) for p in model.with_deviation(v, a)]), (0, 1)
+        )(view, ACTION)
+        assert all(np.isfinite(slope).all() for slope in slopes)
+
+
+def test_an_ensemble_comes_back_bit_by_bit(saved):
+    directory, model, _ = saved
+    loaded = load_model(directory)
+    assert isinstance(loaded, Ensemble)
+    assert jax.tree.structure(loaded) == jax.tree.structure(model)
+    for got, want in zip(jax.tree.leaves(loaded), jax.tree.leaves(model), strict=True):
+        np.testing.assert_array_equal(got, want)
+    description = read_description(directory)
+    assert description["ensemble"]["members"] == MEMBERS
+    assert len(description["training"]["best_epoch"]) == MEMBERS
+    assert description["held_out"]["intervals"]["mass"]["coverage"] > 0.85
+
+
+@pytest.mark.parametrize("change", [{"members": 4}, {"factor": [1.0, 1.0]}, {"members": "many"}])
+def test_a_record_that_does_not_fit_is_refused(saved, tmp_path, change):
+    import shutil
+
+    copy = shutil.copytree(saved[0], tmp_path / "copy")
+    document = json.loads((copy / "model.json").read_text())
+    document["ensemble"].update(change)
+    (copy / "model.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match="damaged"):
+        load_model(copy)
+
+
+def test_a_killed_training_of_an_ensemble_ends_with_the_same_weights(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "_SAVE_EVERY", 0.0)
+    settings = {**LIGHT, "epochs": 4, "hidden": (8,), "dropout": 0.1, "members": 3}
+    few = data.select(data.rollout < 12)
+    whole, _ = train_psi_low(few, out=tmp_path / "whole", **settings)
+
+    class KilledError(Exception):
+        pass
+
+    def killed(done, _):
+        if done == 2:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        train_psi_low(few, out=tmp_path / "m", progress=killed, **settings)
+    seen = []
+    resumed, _ = train_psi_low(
+        few, out=tmp_path / "m", progress=lambda *n: seen.append(n), **settings
+    )
+    assert seen == [(3, 4), (4, 4)]
+    for got, want in zip(jax.tree.leaves(resumed), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_array_equal(got, want)
+
+    # With another number of members nothing is taken over.
+    with pytest.raises(KilledError):
+        train_psi_low(few, out=tmp_path / "m", progress=killed, **settings)
+    seen.clear()
+    fewer = {**settings, "members": 2}
+    train_psi_low(few, out=tmp_path / "m", progress=lambda *n: seen.append(n), **fewer)
+    assert len(seen) == 4
+
+
+def test_members_have_seeds_of_their_own_and_the_first_has_that_of_the_recipe():
+    seeds = fitting.Recipe(1, 1, 1e-3, seed=7, members=6).seeds
+    assert seeds[0] == 7
+    assert len(set(seeds)) == 6
+    assert fitting.Recipe(1, 1, 1e-3, seed=7, members=3).seeds == seeds[:3]
+    assert not set(seeds[1:]) & set(fitting.Recipe(1, 1, 1e-3, seed=8, members=6).seeds)
+    with pytest.raises(InputError, match="members"):
+        fitting.Recipe(1, 1, 1e-3, members=0)
+
+
+# --- in a world
+
+
+@pytest.fixture(scope="module")
+def site():
+    pile = relax(seed_pile("conical", slope=np.radians(30.0), height=2.0))
+    return pile, edge_poses(toe_contour(pile), 2)
+
+
+def test_a_world_of_an_ensemble_is_a_world_like_any_other(saved, site):
+    pile, poses = site
+    world = LowWorld(saved[1])
+    plan = LoadingPlan(poses, action_from(jnp.tile(ACTION, (2, 1))))
+    outcome = jax.jit(wlplan.rollout)(world, pile, plan)
+    lost = np.asarray(pile.height - outcome.pile.height, np.float64).sum() * pile.cell_size**2
+    assert lost * 1.727 == pytest.approx(float(outcome.performance.mass.sum()), rel=1e-3)
+    slope = jax.grad(lambda plan: wlplan.rollout(world, pile, plan).performance.work.sum())(plan)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+
+
+def test_a_world_tells_how_far_it_may_be_off(saved, data, site):
+    pile, poses = site
+    pose = jax.tree.map(lambda leaf: leaf[0], poses)
+    high, _ = train_psi_high(data, dropout=0.0, **{**LIGHT, "epochs": 2, "members": 2})
+    for world in (LowWorld(saved[1]), HybridWorld(high)):
+        told = flat(world.uncertainty(pile, pose, action_from(ACTION)))
+        assert (told > 0.0).all()
+        heading = jax.grad(
+            lambda h, world=world: (
+                world.uncertainty(pile, pose.replace(heading=h), action_from(ACTION)).mass
+            )
+        )(pose.heading)
+        assert np.isfinite(heading)
+    deviation = high.with_deviation(LocalHeightmap(jnp.zeros((36, 36)), 0.1, 0.0), ACTION)[1]
+    assert np.isfinite(flat(deviation)).all()
+
+
+def test_a_world_of_a_single_model_does_not_tell(data, site):
+    pile, poses = site
+    single, _ = train_psi_low(data, **{**LIGHT, "epochs": 1, "members": 1})
+    pose = jax.tree.map(lambda leaf: leaf[0], poses)
+    with pytest.raises(InputError, match="--members"):
+        LowWorld(single).uncertainty(pile, pose, action_from(ACTION))
+
+
+def test_without_intervals_a_report_is_as_it_was(data):
+    single, report = train_psi_low(data, **{**LIGHT, "epochs": 1, "members": 1})
+    assert report.intervals is None
+    assert "intervals" not in report.as_dict()
+    assert dataclasses.asdict(report)["intervals"] is None
+    with pytest.raises(InputError, match="ensemble"):
+        single.with_variance(jnp.zeros(4), ACTION)

@@ -1,0 +1,168 @@
+"""The weights that ship: there, small, loadable, and of today's simulator."""
+
+import json
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from wlplan.automaton import relax
+from wlplan.dataset import VARIABLES, Dataset, differences, probes, probes_of
+from wlplan.diggability import edge_poses
+from wlplan.errors import InputError
+from wlplan.pile import SEED_PILES, seed_pile, toe_contour
+from wlplan.training import load_model, read_description, train_all, weights
+from wlplan.types import action_from
+from wlplan.worlds import MODELS, load_world, pretrained_path
+
+SHIPPED = sorted({kind for kinds in MODELS.values() for kind in kinds})
+REBUILD = "make them again: `make weights`, or `wlplan train all --data DATA.zarr --out DIR`"
+
+
+@pytest.fixture(scope="module")
+def data():
+    """What the models say of the data that they were trained on."""
+    return [read_description(pretrained_path(kind), kind)["dataset"] for kind in SHIPPED]
+
+
+def test_the_shipped_weights_are_of_todays_simulator(data):
+    # All models share their data, so the cycles are played once.
+    assert all(other["fingerprints"] == data[0]["fingerprints"] for other in data), REBUILD
+    assert all(other["probes"] == data[0]["probes"] for other in data), REBUILD
+    wrong = differences(data[0])
+    assert not wrong, (
+        f"the weights that ship were trained on cycles of another simulator than today's "
+        f"({'; '.join(wrong[:3])}): {REBUILD}"
+    )
+
+
+def test_the_check_can_fail(data, monkeypatch):
+    some = data[0]["probes"][:1]
+    assert not differences({**data[0], "probes": some})
+    for name in ("mass", "time", "work", "moved"):
+        (found,) = differences({**data[0], "probes": [{**some[0], name: 1.01 * some[0][name]}]})
+        assert name in found
+    turned = [{**some[0], "characteristics": [v + 0.01 for v in some[0]["characteristics"]]}]
+    assert differences({**data[0], "probes": turned})
+    assert differences({**data[0], "probes": []}) == ["the data set had no cycles to compare with"]
+    soil = {**data[0]["soil"], "friction": 0.5, "stickiness": 1.0}
+    found = differences({**data[0], "probes": some, "soil": soil})
+    assert [entry.split()[0] for entry in found] == ["soil.friction", "soil.stickiness"]
+
+
+def test_probes_are_of_every_seed_pile(data):
+    rollouts = [probe["rollout"] for probe in data[0]["probes"]]
+    assert sorted(set(rollouts)) == list(range(len(SEED_PILES)))
+    assert len(rollouts) == probes._LOADS * len(SEED_PILES)
+
+
+def test_data_of_ones_own_has_no_probes():
+    columns = {name: np.zeros((7, *v.shape), v.dtype) for name, v in VARIABLES.items()}
+    assert probes_of(Dataset(**columns, attributes={})) == []
+
+
+def test_all_weights_together_are_small():
+    files = [path for kind in SHIPPED for path in pretrained_path(kind).rglob("*")]
+    assert sum(path.stat().st_size for path in files if path.is_file()) <= 25e6
+    assert not [path for path in files if path.suffix in (".pkl", ".pickle")]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_learned_world_is_there_and_loads_a_bucket(name):
+    world = load_world(name)
+    pile = relax(seed_pile("conical", slope=np.radians(30.0), height=2.5))
+    pose = jax.tree.map(lambda leaf: leaf[0], edge_poses(toe_contour(pile), 1))
+    action = action_from(jnp.array([0.3, 2.0, 0.2, 3.0]))
+    after, performance = jax.jit(lambda w, p: w(p, pose, action))(world, pile)
+    assert 1.0 < float(performance.mass) < 5.0
+    assert 6.0 < float(performance.time) < 25.0
+    assert 100.0 < float(performance.work) < 1500.0
+    lost = np.asarray(pile.height - after.height, np.float64).sum() * pile.cell_size**2
+    assert lost * 1.727 == pytest.approx(float(performance.mass), rel=1e-3)
+    deviation = world.uncertainty(pile, pose, action)
+    assert 0.01 < float(deviation.mass) < 0.5
+    assert 0.01 < float(deviation.time) < 5.0
+
+
+@pytest.mark.parametrize("kind", [kind for kind in SHIPPED if kind.startswith("psi")])
+def test_the_interval_held_what_it_says_on_held_out_cycles(kind):
+    intervals = read_description(pretrained_path(kind), kind)["held_out"]["intervals"]
+    for interval in intervals.values():
+        assert 0.85 <= interval["coverage"] <= 0.95
+
+
+@pytest.mark.parametrize("kind", SHIPPED)
+def test_a_model_for_another_grid_is_refused_in_one_line(kind, tmp_path):
+    copy = shutil.copytree(pretrained_path(kind), tmp_path / kind)
+    document = json.loads((copy / "model.json").read_text())
+    for change in ({"cell_size": 0.2}, {"state_cells": 64}):
+        grid = {**document["grid"], **change}
+        (copy / "model.json").write_text(json.dumps({**document, "grid": grid}))
+        with pytest.raises(InputError, match=next(iter(change))) as error:
+            load_model(copy, kind)
+        assert "\n" not in str(error.value)
+    for grid in ("fine", None):
+        (copy / "model.json").write_text(json.dumps({**document, "grid": grid}))
+        with pytest.raises(InputError, match="grid"):
+            load_model(copy, kind)
+
+
+def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(tmp_path, monkeypatch):
+    """The trainings themselves have tests of their own."""
+    collected, trained, told = [], [], []
+
+    def collect(path, *, cycles, seed, protocol, progress):
+        collected.append((path.name, cycles, seed, protocol))
+        progress(cycles, cycles)
+
+    few = Dataset(
+        **{name: np.zeros((3, *v.shape), v.dtype) for name, v in VARIABLES.items()},
+        attributes={},
+    )
+    monkeypatch.setattr(weights, "collect", collect)
+    monkeypatch.setattr(weights, "open_dataset", lambda path: few)
+    monkeypatch.setattr(weights, "is_new", lambda path: len(collected) < 2)
+    monkeypatch.setattr(weights, "read_attributes", lambda path: {"cycles": 1, "cycles_done": 1})
+
+    def trainer(kind, fails):
+        def train(dataset, *, out, progress, **settings):
+            if fails and not trained.count("broke"):
+                trained.append("broke")
+                raise KeyboardInterrupt
+            trained.append((kind, settings["seed"]))
+            shutil.copytree(pretrained_path(kind), out)
+            document = json.loads((out / "model.json").read_text())
+            document["dataset"]["fingerprints"] = [weights.fingerprint(each) for each in dataset]
+            document["training"] |= settings
+            document["versions"] = weights.versions()
+            (out / "model.json").write_text(json.dumps(document))
+            progress(1, 1)
+
+        return train
+
+    for kind, (_, settings) in weights._TRAININGS.items():
+        monkeypatch.setitem(weights._TRAININGS, kind, (trainer(kind, kind == "psi_high"), settings))
+    call = {"seed": 3, "progress": lambda *news: told.append(news)}
+    with pytest.raises(KeyboardInterrupt):
+        train_all(tmp_path / "d.zarr", tmp_path / "out", **call)
+    reports = train_all(tmp_path / "d.zarr", tmp_path / "out", **call)
+    cycles = weights.CYCLES
+    assert collected == [
+        ("d.zarr", cycles, 3, "paper"),
+        ("d-corridor.zarr", cycles, 4, "corridor"),
+    ]
+    assert trained == [("psi_low", 3), "broke", ("psi_high", 3), ("phi", 3)]
+    assert told[0] == ("cycles, protocol paper", cycles, cycles)
+    assert set(reports) == set(SHIPPED)
+    train_all(tmp_path / "d.zarr", tmp_path / "out", **call)
+    assert len(trained) == 4
+    # Other settings are another training.
+    shutil.rmtree(tmp_path / "out")
+    train_all(tmp_path / "d.zarr", tmp_path / "out", seed=4, progress=call["progress"])
+    assert trained[4:] == [("psi_low", 4), ("psi_high", 4), ("phi", 4)]
+
+
+def test_every_model_that_a_world_needs_is_trained():
+    assert set(weights._TRAININGS) == set(SHIPPED)

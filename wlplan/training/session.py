@@ -1,0 +1,171 @@
+"""What every training does: split the data, fit and resume, evaluate, save."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from flax import nnx
+
+from wlplan.dataset import Dataset, fingerprint, join, probes_of, split, versions
+from wlplan.errors import InputError
+from wlplan.training.fitting import Loss, Recipe, SavedState, fitted
+from wlplan.training.storage import Model, architecture, check_target, kind_of_network, save_model
+from wlplan.types import PyTree
+
+# Training, validation and test. Paper, section 6.4: 10,718 cycles, 1,072 of them for the test,
+# 10 % of the rest for validation.
+_FRACTIONS = (0.8, 0.1, 0.1)
+
+
+@runtime_checkable
+class Report(Protocol):
+    """Errors of a model, as JSON has them."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The errors by name."""
+
+
+AnyModel = TypeVar("AnyModel", bound=Model)
+AnyReport = TypeVar("AnyReport", bound=Report)
+
+
+class Session:
+    """A training from its data set to the saved model.
+
+    The data set is split by rollout, without the cycles that are not valid. Killed, a training that
+    is asked for again goes on where it was and ends with the same weights.
+
+    Args:
+        dataset: Loading cycles, of one or several data sets; each is split by itself.
+        out: Directory to save to; an older model there is replaced. None: nothing is saved.
+        recipe: How long and how fast.
+        tables: Arrays of a part of the data that the training looks at.
+
+    Attributes:
+        parts: Training, validation and test part.
+        tables: Arrays of each part, by name.
+
+    Raises:
+        InputError: If the data set is too small or not finite, or the directory cannot be one of
+            a model.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset | Sequence[Dataset],
+        out: str | os.PathLike[str] | None,
+        recipe: Recipe,
+        tables: Callable[[Dataset], Mapping[str, np.ndarray]],
+    ):
+        self._out = None if out is None else Path(out)
+        if self._out is not None:
+            check_target(self._out)
+        datasets = [dataset] if isinstance(dataset, Dataset) else list(dataset)
+        splits = [split(each, fractions=_FRACTIONS) for each in datasets]
+        joined = [join(parts) for parts in zip(*splits, strict=True)]
+        self.parts = [part.select(part.valid) for part in joined]
+        if not all(len(part) for part in self.parts):
+            raise InputError("The data set has too few valid cycles to split: collect more cycles.")
+        self.tables = [tables(part) for part in self.parts]
+        if not all(np.isfinite(v).all() for table in self.tables for v in table.values()):
+            raise InputError("The data set holds numbers that are not finite: collect it again.")
+        self._recipe = recipe
+        self._data = {
+            "fingerprints": [fingerprint(each) for each in datasets],
+            # Of the first; the others are of the same soil and machine.
+            **datasets[0].attributes,
+            "protocols": [each.attributes.get("protocol") for each in datasets],
+            "probes": probes_of(datasets[0]),
+        }
+        self._records: dict[str, dict[str, Any]] = {}
+        self._states: list[SavedState] = []
+
+    def fit(
+        self,
+        networks: nnx.Module | list[nnx.Module],
+        loss: Loss,
+        examples: list[PyTree],
+        *,
+        stage: str = "",
+        whole: nnx.Module | None = None,
+        augment: Callable[..., PyTree] | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Any:
+        """Fits a network, or the members of an ensemble, to examples.
+
+        Args:
+            networks: Network to start from, or those of all members.
+            loss: Loss to reduce.
+            examples: Examples of the training and of the validation part.
+            stage: Name of a part of the training, where it has several.
+            whole: Network that the one to fit is a part of, where it is one.
+            augment: Changes the examples of a step at random.
+            progress: Called with the number of epochs done and in all.
+
+        Returns:
+            The state with the least validation loss; of members stacked.
+
+        Raises:
+            InputError: If the training diverges.
+        """
+        network = networks[0] if isinstance(networks, list) else networks
+        state = self._state_of(whole or network, stage)
+        best, self._records[stage] = fitted(
+            networks,
+            loss,
+            examples[0],
+            examples[1],
+            self._recipe,
+            augment=augment,
+            state=state,
+            progress=progress,
+        )
+        return best
+
+    def finish(
+        self, model: AnyModel, evaluate: Callable[[AnyModel, Dataset], AnyReport]
+    ) -> AnyReport:
+        """Evaluates a model on the test part and saves it.
+
+        Raises:
+            InputError: If it cannot be evaluated or saved.
+        """
+        report = evaluate(model, self.parts[2])
+        if self._out is not None:
+            records = self._records.get("", self._records)
+            training = {
+                **records,
+                "fractions": _FRACTIONS,
+                "cycles": [len(part) for part in self.parts],
+            }
+            save_model(
+                self._out,
+                model,
+                {"training": training, "dataset": self._data, "held_out": report.as_dict()},
+            )
+            for state in self._states:
+                state.remove()
+        return report
+
+    def _state_of(self, network: nnx.Module, stage: str) -> SavedState | None:
+        """Where the fit of a stage is kept, under everything that its result follows from."""
+        if self._out is None:
+            return None
+        identity = {
+            "dataset": self._data["fingerprints"],
+            "fractions": _FRACTIONS,
+            "recipe": self._recipe.as_dict(),
+            "kind": kind_of_network(network),
+            "architecture": architecture(network),
+            "stage": stage,
+            "versions": versions(),
+        }
+        place = self._out.absolute()
+        name = ".".join(filter(None, (f".{place.name}", stage, "training.npz")))
+        state = SavedState(place.with_name(name), identity)
+        self._states.append(state)
+        return state
