@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "wlplan"
 
 # From the bottom to the top: a module imports only from what stands before it.
 LAYERS = [
-    *("errors", "types", "units", "compilation", "io.files"),
+    *("errors", "types", "units", "compilation", "published", "io.files"),
     *("machine", "presets"),
     *("ground", "pile"),
     *("heightmap", "characteristics"),
@@ -42,9 +42,10 @@ LAYERS = [
         "report",
     ),
     *("bench.timing", "bench.digs", "bench.baselines", "bench.setup", "bench.automata"),
-    *("bench.rollouts", "bench.planning", "bench.items", "bench"),
+    *("bench.inference", "bench.rollouts", "bench.planning", "bench.items", "bench"),
     *("cli.options", "cli.outputs", "cli.inputs", "cli.progress", "cli.played", "cli.engines"),
-    *("cli.planning", "cli.maps", "cli.gradients", "cli.learning", "cli.benchmark"),
+    *("cli.planning", "cli.maps", "cli.gradients", "cli.evaluated", "cli.learning"),
+    "cli.benchmark",
     *("cli", "__main__"),
 ]
 
