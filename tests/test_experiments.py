@@ -18,12 +18,14 @@ from wlplan.types import LocalHeightmap
 
 ROOT = Path(__file__).parents[1]
 # What the others share, and the recipe of a data set: none has a result of its own.
-OTHERS = {"record", "replays", "dem_cycles"}
+OTHERS = {"record", "replays", "trained", "dem_cycles"}
 NAMES = sorted(
     module.name
     for module in pkgutil.iter_modules(experiments.__path__)
     if module.name not in OTHERS
 )
+# Whose full preset has not been run with the models of today: `experiments/README.md` says so.
+NOT_RUN = {"learning_curve", "sequential_loading"}
 
 
 def test_there_are_experiments_and_each_can_run_and_draw():
@@ -49,7 +51,12 @@ def test_the_smoke_preset_writes_numbers_and_a_picture(name, tmp_path):
     assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("name", NAMES)
+def test_what_has_a_result_and_what_has_not_is_known():
+    committed = {path.stem for path in (ROOT / "experiments" / "results").glob("*.json")}
+    assert committed & set(NAMES) == set(NAMES) - NOT_RUN
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMES) - NOT_RUN))
 def test_committed_results_are_of_the_full_preset_and_can_be_drawn(name, tmp_path):
     path = ROOT / "experiments" / "results" / f"{name}.json"
     result = json.loads(path.read_text())

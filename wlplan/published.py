@@ -23,12 +23,12 @@ class PileStateResult(NamedTuple):
 
 
 class SequenceResult(NamedTuple):
-    """Sums over 40 loadings in sequence, the last row of table 3."""
+    """A column block of table 3: sums over loadings in sequence, after 5, 10, ... 40 of them."""
 
-    mass: float  # [tonne]
-    time: float  # [s]
-    work: float  # [MJ]
-    volume: float  # of the pile that is left [m³]
+    mass: tuple[float, ...]  # [tonne]
+    time: tuple[float, ...]  # [s]
+    work: tuple[float, ...]  # [MJ]
+    volume: tuple[float, ...]  # of the pile that is left [m³]
 
 
 PERFORMANCE = {
@@ -45,9 +45,27 @@ PILE_STATE = {
 }
 """Table 2, with and without post-processing."""
 
+SEQUENCE_LOADS = (5, 10, 15, 20, 25, 30, 35, 40)
+"""Loadings after which table 3 has the sums."""
+
 SEQUENCE = {
-    "simulator": SequenceResult(116.0, 443.0, 17.9, 709.5),
-    "high": SequenceResult(118.6, 441.9, 17.4, 664.2),
-    "low": SequenceResult(130.9, 418.8, 16.6, 700.6),
+    "simulator": SequenceResult(
+        (14.7, 28.2, 40.8, 56.8, 71.0, 86.1, 101.4, 116.0),
+        (55.8, 106.1, 161.1, 218.0, 273.7, 327.3, 389.4, 443.0),
+        (2.0, 4.1, 6.5, 8.9, 11.1, 13.2, 15.7, 17.9),
+        (768.6, 760.7, 753.3, 744.0, 735.7, 726.9, 718.0, 709.5),
+    ),
+    "high": SequenceResult(
+        (15.7, 31.5, 45.3, 62.0, 75.4, 90.5, 106.3, 118.6),
+        (53.2, 101.0, 155.4, 210.8, 265.7, 318.7, 385.1, 441.9),
+        (2.0, 3.9, 6.1, 8.5, 10.6, 12.8, 15.3, 17.4),
+        (765.9, 755.9, 745.6, 728.7, 714.7, 700.1, 679.1, 664.2),
+    ),
+    "low": SequenceResult(
+        (16.1, 31.3, 47.0, 64.4, 80.6, 96.6, 114.3, 130.9),
+        (54.5, 101.9, 154.5, 208.1, 260.2, 308.9, 369.9, 418.8),
+        (2.0, 3.8, 6.0, 8.3, 10.4, 12.4, 14.6, 16.6),
+        (767.7, 758.8, 749.7, 739.5, 730.1, 720.7, 710.4, 700.6),
+    ),
 }
-"""Table 3, by world."""
+"""Table 3, by world: one pile and one sequence of loadings."""
