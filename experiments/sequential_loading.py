@@ -87,6 +87,9 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
         rows[name] = {
             "growth": _growth(own, truth, volumes),
             "growth_on_the_simulators_pile": _growth(given, truth, volumes),
+            # Of equation 5, over the sum of what was simulated: errors of single loads do not
+            # cancel there.
+            "sum_of_error_sizes": _sizes(own, truth),
             "misplaced_m3": np.mean([part[2] for part in own], axis=0).round(3).tolist(),
             "time_error_s": _by_stall(own, truth),
         }
@@ -222,6 +225,15 @@ def _growth(
         }
         for name, values in zip(QUANTITIES, (*np.moveaxis(errors, -1, 0), left), strict=True)
     }
+
+
+def _sizes(
+    played: list[tuple[np.ndarray, np.ndarray, np.ndarray]], truth: Float[np.ndarray, "p n 3"]
+) -> dict[str, float]:
+    """Sum of the sizes of the loads' errors over the sum of the outcomes, mean over the piles."""
+    errors = np.abs(np.array([outcomes for outcomes, _, _ in played]) - truth).sum(axis=1)
+    relative = (errors / truth.sum(axis=1)).mean(axis=0)
+    return dict(zip(OUTCOMES, relative.tolist(), strict=True))
 
 
 def _summary(errors: Float[np.ndarray, " p"]) -> dict[str, float]:
