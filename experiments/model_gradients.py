@@ -28,7 +28,6 @@ from experiments.simulator_gradients import (
     LINE_SLOPE_DEGREES,
     LOADS,
     OUTCOMES,
-    PARTS,
     ROLLOUTS,
     SCALE,
     SEED,
@@ -48,6 +47,15 @@ from wlplan.plots.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
 from wlplan.types import Pile, Pose
 from wlplan.units import CELL_SIZE
 
+# Parts of a gradient: the poses of the data set lie on the toe, so what the way ahead does has
+# never been seen; a planner moves along the toe and turns.
+PARTS = {
+    "action": slice(3, 7),
+    "pose": slice(0, 3),
+    "ahead": slice(0, 1),
+    "aside and turned": slice(1, 3),
+    "all": slice(0, 7),
+}
 # Half the width of the simulator's central differences, in the units of a component (1 m, 0.1 rad
 # and a tenth of an action's range): the derivative; 1 cm and 0.1 % of the range; 10 cm and 1 %;
 # 0.5 m, 3 degrees and 5 %, about as far as a planner moves.
@@ -119,7 +127,16 @@ def _jacobians(
         np.asarray(_value_and_jacobian(model, *map(jnp.asarray, case))[1])
         for case in zip(*cases, strict=True)
     ]
-    return np.array(rows) * UNITS
+    return _in_its_frame(np.array(rows) * UNITS, cases[2])
+
+
+def _in_its_frame(
+    tables: Float[np.ndarray, "n 3 7"], vectors: Float[np.ndarray, "n 7"]
+) -> Float[np.ndarray, "n 3 7"]:
+    """Derivatives by x and y turned into those by the way ahead and to the left of the pose."""
+    cos, sin = np.cos(vectors[:, 2]), np.sin(vectors[:, 2])
+    turn = np.array([[cos, -sin], [sin, cos]]).transpose(2, 0, 1)
+    return np.concatenate([tables[:, :, :2] @ turn, tables[:, :, 2:]], axis=2)
 
 
 def _differences(
@@ -135,7 +152,10 @@ def _differences(
         tables.append((ahead - behind) / (2.0 * widths[:, None]))
         if n % 20 == 0:
             print(f"{n} of {len(cases[0])} cycles", file=sys.stderr, flush=True)
-    return dict(zip(STEPS, np.moveaxis(np.array(tables), 2, 0), strict=True))
+    by_step = np.moveaxis(np.array(tables), 2, 0)
+    return {
+        name: _in_its_frame(table, cases[2]) for name, table in zip(STEPS, by_step, strict=True)
+    }
 
 
 def _agreement(
@@ -239,8 +259,8 @@ def draw(folder: Path) -> None:
                     panel.plot(line["place"], curve, lw=1.3, color=colour, label=activation)
                 if what == "derivative":
                     # The simulator's jumps would make all else flat.
-                    size = 2.0 * np.abs(shown).max()
-                    panel.set_ylim(-size, size)
+                    low, high = np.min(shown), np.max(shown)
+                    panel.set_ylim(low - 0.4 * (high - low), high + 0.4 * (high - low))
                     panel.axhline(0.0, color=INK, lw=0.5)
                 tidy(panel)
             row[0].set_ylabel(f"{kind.replace('psi', 'ψ')}: {what}", fontsize=8)

@@ -33,7 +33,7 @@ from scipy.spatial import cKDTree
 from experiments.record import described, main
 from experiments.replays import in_batches, surfaces
 from experiments.trained import PSI, SHORT, trained
-from wlplan.dataset import Dataset, split
+from wlplan.dataset import LOADS, Dataset, split
 from wlplan.heightmap import PERFORMANCE_CELLS, STATE_CELLS, STATE_DISPLACEMENT
 from wlplan.io import write_bytes_atomic
 from wlplan.models.performance import PerformanceModel
@@ -48,6 +48,11 @@ SEED = 11
 CYCLES, REPEATS = 250, 12
 NAMES = ("mass", "time", "work")
 MODELS = ("psi_low, swish", "psi_high, swish")
+SHAPE = (STATE_CELLS, STATE_CELLS)
+# More neighbours than these are not looked at in vain: some cycles are not valid.
+INVALID = 30
+# Kinds that are floors of one of the models, by what it is not told.
+COMPARED = ("around the map", "same characteristics")
 # Below this height over the floor a change fades out: level ground stays level [m].
 FADE = 0.1
 # Smooth change around the map: its spread and length, and the width of the transition [m].
@@ -67,14 +72,13 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
         for title in MODELS
     }
     truth = np.stack([getattr(chosen, name) for name in NAMES], axis=1).astype(np.float64)
-    played = {
-        kind: _played(change(surfaces(chosen), repeats, random), chosen.action)
-        for kind, change in CHANGES.items()
-    }
-    played["same characteristics"] = _same_characteristics(
-        chosen, data, predictors["psi_low, swish"], repeats
-    )
-    again = _played(surfaces(chosen)[:, None], chosen.action)[:, 0]
+    others = _alike(chosen, data, repeats)
+    variants = {kind: change(surfaces(chosen), repeats, random) for kind, change in CHANGES.items()}
+    variants["same characteristics"] = surfaces(others).reshape(cycles, repeats, *SHAPE)
+    variants["again"] = surfaces(chosen)[:, None]
+    played = _played(variants, chosen.action)
+    again = played.pop("again")[:, 0]
+    played["same characteristics"] *= _excess(predictors["psi_low, swish"], chosen, others)
     floors = {kind: floor(values) for kind, values in played.items()}
     errors = {}
     for title, model in predictors.items():
@@ -92,7 +96,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
         },
         "error": {title: _named(values) for title, values in errors.items()},
         "error_over_floor": {
-            title: {kind: _named(values / floors[kind]) for kind in floors}
+            title: {kind: _named(values / floors[kind]) for kind in COMPARED}
             for title, values in errors.items()
         },
     }
@@ -121,48 +125,52 @@ def floor(repeats: Float[np.ndarray, "n r 3"]) -> Float[np.ndarray, "3"]:
 
 
 def _played(
-    surface: Float[np.ndarray, "n r 52 52"], action: Float[np.ndarray, "n 4"]
-) -> Float[np.ndarray, "n r 3"]:
-    """Mass, time and work of loadings on several surfaces each."""
+    variants: dict[str, Float[np.ndarray, "n r 52 52"]], action: Float[np.ndarray, "n 4"]
+) -> dict[str, Float[np.ndarray, "n r 3"]]:
+    """Mass, time and work of loadings on several surfaces each, of several kinds."""
 
     def outcomes(height: Array, ground: Array, action: Action) -> tuple[Array, ...]:
         cycle = dig(height, ground, action)
         work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
         return cycle.mass / KG_PER_TONNE, cycle.time, work / J_PER_KJ
 
-    n, r = surface.shape[:2]
-    rows = surface.reshape(n * r, *surface.shape[2:])
-    values = np.stack(in_batches(outcomes, rows, np.repeat(action, r, axis=0)), axis=-1)
-    return values.reshape(n, r, 3).astype(np.float64)
+    # All at once, so that it is compiled once.
+    rows = np.concatenate([v.reshape(-1, *SHAPE).astype(np.float32) for v in variants.values()])
+    actions = np.concatenate([np.repeat(action, v.shape[1], axis=0) for v in variants.values()])
+    values = np.stack(in_batches(outcomes, rows, actions), axis=-1).astype(np.float64)
+    ends = np.cumsum([v.shape[0] * v.shape[1] for v in variants.values()])[:-1]
+    return {
+        kind: part.reshape(*variants[kind].shape[:2], 3)
+        for kind, part in zip(variants, np.split(values, ends), strict=True)
+    }
 
 
-def _same_characteristics(
-    chosen: Dataset, data: Dataset, psi_low: PerformanceModel, repeats: int
-) -> Float[np.ndarray, "n r 3"]:
-    """The action of each loading on the surfaces nearest to its own in characteristics."""
+def _alike(chosen: Dataset, data: Dataset, repeats: int) -> Dataset:
+    """For each loading those nearest to it in characteristics, of other rollouts; n times R."""
     spread = data.characteristics.std(axis=0)
     tree = cKDTree(data.characteristics / spread)
-    # Loadings of one rollout dig the same pile, and so do those before and after; enough are asked
-    # for to leave all of them out.
-    _, near = tree.query(chosen.characteristics / spread, k=min(repeats + 60, len(data)))
-    which = np.array(
-        [
-            [n for n in row if data.valid[n] and data.rollout[n] != own][:repeats]
-            for row, own in zip(near, chosen.rollout, strict=True)
-        ]
-    )
-    others = data.select(which.reshape(-1))
+    # Loadings of one rollout dig one pile: enough are asked for to leave all of them out.
+    count = min(repeats + LOADS + INVALID, len(data))
+    _, near = tree.query(chosen.characteristics / spread, k=count)
+    which = [
+        [n for n in row if data.valid[n] and data.rollout[n] != own][:repeats]
+        for row, own in zip(near, chosen.rollout, strict=True)
+    ]
+    return data.select(np.array(which).reshape(-1))
+
+
+def _excess(model: PerformanceModel, chosen: Dataset, others: Dataset) -> np.ndarray:
+    """What the characteristics of others make of the outcome by ψ_low, inverted; [n, R, 3]."""
+    repeats = len(others) // len(chosen)
     action = np.repeat(chosen.action, repeats, axis=0)
-    values = _played(surfaces(others)[:, None], action)[:, 0].reshape(*which.shape, 3)
 
     def expected(characteristics: np.ndarray) -> np.ndarray:
         table = dataclasses.replace(others, characteristics=characteristics, action=action)
-        predicted = predict(psi_low, table)
-        columns = [np.asarray(getattr(predicted, name), np.float64) for name in NAMES]
-        return np.stack(columns, axis=-1).reshape(*which.shape, 3)
+        predicted = predict(model, table)
+        return np.stack([np.asarray(getattr(predicted, name), np.float64) for name in NAMES], -1)
 
     own = expected(np.repeat(chosen.characteristics, repeats, axis=0))
-    return values * own / expected(others.characteristics)
+    return (own / expected(others.characteristics)).reshape(len(chosen), repeats, 3)
 
 
 def _faded(surface: np.ndarray, repeats: int, change: np.ndarray) -> np.ndarray:
@@ -173,7 +181,7 @@ def _faded(surface: np.ndarray, repeats: int, change: np.ndarray) -> np.ndarray:
 
 def _rough(size: float) -> Callable[[np.ndarray, int, np.random.Generator], np.ndarray]:
     def change(surface: np.ndarray, repeats: int, random: np.random.Generator) -> np.ndarray:
-        shape = (len(surface), repeats, STATE_CELLS, STATE_CELLS)
+        shape = (len(surface), repeats, *SHAPE)
         return _faded(surface, repeats, random.normal(0.0, size, shape))
 
     return change
@@ -181,10 +189,10 @@ def _rough(size: float) -> Callable[[np.ndarray, int, np.random.Generator], np.n
 
 def around(surface: np.ndarray, repeats: int, random: np.random.Generator) -> np.ndarray:
     """Surfaces that differ outside the map of ψ_high only; [n, 52, 52] to [n, repeats, 52, 52]."""
-    noise = random.normal(size=(len(surface), repeats, STATE_CELLS, STATE_CELLS))
+    noise = random.normal(size=(len(surface), repeats, *SHAPE))
     sigma = AROUND_LENGTH / CELL_SIZE
     noise = ndimage.gaussian_filter(noise, (0.0, 0.0, sigma, sigma))
-    inside = np.zeros((STATE_CELLS, STATE_CELLS), bool)
+    inside = np.zeros(SHAPE, bool)
     ahead = round(STATE_DISPLACEMENT / CELL_SIZE)
     aside = (STATE_CELLS - PERFORMANCE_CELLS) // 2
     inside[ahead : ahead + PERFORMANCE_CELLS, aside : aside + PERFORMANCE_CELLS] = True

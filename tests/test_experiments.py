@@ -1,6 +1,7 @@
 """Every experiment runs in its smoke preset and draws its figure."""
 
 import importlib
+import inspect
 import json
 import pkgutil
 import subprocess
@@ -25,7 +26,7 @@ NAMES = sorted(
     if module.name not in OTHERS
 )
 # Whose full preset has not been run with the models of today: `experiments/README.md` says so.
-NOT_RUN = {"learning_curve", "model_gradients", "noise_floor"}
+NOT_RUN = {"learning_curve"}
 
 
 def test_there_are_experiments_and_each_can_run_and_draw():
@@ -36,11 +37,24 @@ def test_there_are_experiments_and_each_can_run_and_draw():
         assert callable(module.draw)
 
 
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory):
+    """Data set and models that the smoke presets collect and train once, not each its own."""
+    folder = tmp_path_factory.mktemp("experiments")
+    return {"data": folder / "cycles.zarr", "models": folder / "models"}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_the_smoke_preset_writes_numbers_and_a_picture(name, tmp_path):
+def test_the_smoke_preset_writes_numbers_and_a_picture(name, tmp_path, shared):
+    needs = inspect.signature(importlib.import_module(f"experiments.{name}").run).parameters
+    places = [[f"--{what}", str(place)] for what, place in shared.items() if what in needs]
     subprocess.run(
-        [sys.executable, "-m", f"experiments.{name}", "--preset", "smoke", "--out", str(tmp_path)],
+        [
+            *(sys.executable, "-m", f"experiments.{name}", "--preset", "smoke"),
+            *("--out", str(tmp_path)),
+            *(word for words in places for word in words),
+        ],
         check=True,
         cwd=ROOT,
         capture_output=True,

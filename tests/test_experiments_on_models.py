@@ -171,3 +171,16 @@ def test_the_summary_of_cosines_counts_what_points_nowhere():
     assert some["cycles"] == 99
     assert some["positive"] == pytest.approx(69 / 99)
     assert some["p10"] == pytest.approx(-1.0)
+
+
+def test_derivatives_are_turned_into_the_frame_of_the_pose():
+    """Of f = 2 ahead + 3 aside, at a pose that looks along 30 degrees."""
+    heading = np.radians(30.0)
+    ahead, aside = (np.cos(heading), np.sin(heading)), (-np.sin(heading), np.cos(heading))
+    world = np.zeros((1, 3, 7))
+    world[0, :, :2] = 2.0 * np.array(ahead) + 3.0 * np.array(aside)
+    world[0, :, 2:] = 5.0
+    vector = np.array([[1.0, 2.0, heading, 0.0, 0.0, 0.0, 0.0]])
+    found = model_gradients._in_its_frame(world, vector)
+    np.testing.assert_allclose(found[0, :, :2], [[2.0, 3.0]] * 3)
+    np.testing.assert_array_equal(found[0, :, 2:], 5.0)
