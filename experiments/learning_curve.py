@@ -96,6 +96,8 @@ def draw(folder: Path) -> None:
             at = 100.0 * paper[quantity]
             panel.plot(paper["cycles"], at, "x", ms=6, color=colour, label=label)
         panel.set_xscale("log")
+        panel.set_xticks(cycles, [f"{count:,}" for count in cycles])
+        panel.minorticks_off()
         panel.set_ylim(bottom=0.0)
         panel.set_title(f"{quantity}, mean relative error [%]", fontsize=8)
         panel.set_xlabel("cycles for training and validation", fontsize=8, color=FAINT)

@@ -1,5 +1,7 @@
 """What the experiments on trained models compute: floors, sums of errors, cosines, kept models."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from test_training import synthetic
 
 from experiments import learning_curve, model_gradients, noise_floor, sequential_loading
 from experiments.trained import trained
+from wlplan import training
 from wlplan.dataset import fingerprint
 from wlplan.types import Performance
 from wlplan.units import CELL_SIZE
@@ -21,23 +24,33 @@ def test_a_model_is_trained_once_and_found_again(tmp_path, monkeypatch):
     first, seconds = trained(tmp_path, data, "psi_low", **settings)
     assert seconds > 0.0
     with monkeypatch.context() as patched:
-        patched.setattr("wlplan.training.train_psi_low", None)
+        refuses = functools.wraps(training.train_psi_low)(lambda *_, **__: 1 / 0)
+        patched.setattr("wlplan.training.train_psi_low", refuses)
         again, same = trained(tmp_path, data, "psi_low", **settings)
     assert same == seconds
     inputs = jnp.asarray(data.characteristics[0]), jnp.asarray(data.action[0])
     assert first(*inputs).mass == again(*inputs).mass
     trained(tmp_path, data, "psi_low", seed=1, **settings)
     trained(tmp_path, data.select(data.rollout < 8), "psi_low", **settings)
+    train = training.train_psi_low
+
+    def with_another_default(dataset, *, learning_rate=1e-3, **others):
+        return train(dataset, learning_rate=learning_rate, **others)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("wlplan.training.train_psi_low", with_another_default)
+        trained(tmp_path, data, "psi_low", **settings)
     names = [path.name for path in tmp_path.iterdir() if path.is_dir()]
-    assert len(names) == 3
-    assert sum(fingerprint(data)[7:15] in name for name in names) == 2
+    assert len(names) == 4
+    assert sum(fingerprint(data)[7:15] in name for name in names) == 3
 
 
 def test_a_training_that_was_cut_short_has_no_time(tmp_path, monkeypatch):
     data = synthetic(rollouts=10, loads=6)
     settings = {"epochs": 1, "hidden": (4,)}
     with monkeypatch.context() as patched:
-        patched.setattr("wlplan.training.train_psi_low", lambda *_, **__: 1 / 0)
+        fails = functools.wraps(training.train_psi_low)(lambda *_, **__: 1 / 0)
+        patched.setattr("wlplan.training.train_psi_low", fails)
         with pytest.raises(ZeroDivisionError):
             trained(tmp_path, data, "psi_low", **settings)
     assert trained(tmp_path, data, "psi_low", **settings)[1] is None
