@@ -26,6 +26,8 @@ PRESETS = ("full", "smoke")
 # The data set of the experiments that need one: where it lies, and its cycles. Paper, section 6.2.
 DATA = Path("out") / "cycles.zarr"
 CYCLES, SMOKE_CYCLES = 10_800, 180
+# The models that experiments train, see `experiments.trained`.
+MODELS = Path("out") / "models"
 
 
 def conditions() -> dict[str, Any]:
@@ -88,10 +90,12 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
 
     Args:
         name: Name of its module.
-        run: Function of the preset to the result; of a data set too if it has a parameter `data`.
+        run: Function of the preset to the result; of a data set and of the folder of trained models
+            too if it has parameters `data` and `models`.
         draw: Draws the result that lies in a folder there.
     """
-    needs_data = "data" in inspect.signature(run).parameters
+    needs = inspect.signature(run).parameters
+    needs_data = "data" in needs
     parser = argparse.ArgumentParser(prog=f"python -m experiments.{name}")
     parser.add_argument("--preset", choices=PRESETS, default="full")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of results")
@@ -102,12 +106,20 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
             type=Path,
             help=f"data set; collected if it is not there (default {DATA}, for smoke a new one)",
         )
+    if "models" in needs:
+        parser.add_argument(
+            "--models",
+            type=Path,
+            help=f"trained models; missing ones are trained (default {MODELS}, for smoke new ones)",
+        )
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     if not options.draw:
-        more = {}
+        more: dict[str, Any] = {}
+        smoke = options.preset == "smoke"
+        if "models" in needs:
+            more["models"] = options.models or (options.out / MODELS.name if smoke else MODELS)
         if needs_data:
-            smoke = options.preset == "smoke"
             path = options.data or (options.out / DATA.name if smoke else DATA)
             try:
                 more["data"] = cycles_at(path, options.preset)

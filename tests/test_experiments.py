@@ -1,6 +1,7 @@
 """Every experiment runs in its smoke preset and draws its figure."""
 
 import importlib
+import inspect
 import json
 import pkgutil
 import subprocess
@@ -18,12 +19,14 @@ from wlplan.types import LocalHeightmap
 
 ROOT = Path(__file__).parents[1]
 # What the others share, and the recipe of a data set: none has a result of its own.
-OTHERS = {"record", "replays", "dem_cycles"}
+OTHERS = {"record", "replays", "trained", "dem_cycles"}
 NAMES = sorted(
     module.name
     for module in pkgutil.iter_modules(experiments.__path__)
     if module.name not in OTHERS
 )
+# Whose full preset has not been run yet: `experiments/README.md` says so.
+NOT_RUN: set[str] = set()
 
 
 def test_there_are_experiments_and_each_can_run_and_draw():
@@ -34,11 +37,24 @@ def test_there_are_experiments_and_each_can_run_and_draw():
         assert callable(module.draw)
 
 
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory):
+    """Data set and models that the smoke presets collect and train once, not each its own."""
+    folder = tmp_path_factory.mktemp("experiments")
+    return {"data": folder / "cycles.zarr", "models": folder / "models"}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_the_smoke_preset_writes_numbers_and_a_picture(name, tmp_path):
+def test_the_smoke_preset_writes_numbers_and_a_picture(name, tmp_path, shared):
+    needs = inspect.signature(importlib.import_module(f"experiments.{name}").run).parameters
+    places = [[f"--{what}", str(place)] for what, place in shared.items() if what in needs]
     subprocess.run(
-        [sys.executable, "-m", f"experiments.{name}", "--preset", "smoke", "--out", str(tmp_path)],
+        [
+            *(sys.executable, "-m", f"experiments.{name}", "--preset", "smoke"),
+            *("--out", str(tmp_path)),
+            *(word for words in places for word in words),
+        ],
         check=True,
         cwd=ROOT,
         capture_output=True,
@@ -49,7 +65,12 @@ def test_the_smoke_preset_writes_numbers_and_a_picture(name, tmp_path):
     assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("name", NAMES)
+def test_what_has_a_result_and_what_has_not_is_known():
+    committed = {path.stem for path in (ROOT / "experiments" / "results").glob("*.json")}
+    assert committed & set(NAMES) == set(NAMES) - NOT_RUN
+
+
+@pytest.mark.parametrize("name", sorted(set(NAMES) - NOT_RUN))
 def test_committed_results_are_of_the_full_preset_and_can_be_drawn(name, tmp_path):
     path = ROOT / "experiments" / "results" / f"{name}.json"
     result = json.loads(path.read_text())

@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parents[1] / "wlplan"
 
 # From the bottom to the top: a module imports only from what stands before it.
 LAYERS = [
-    *("errors", "types", "units", "precision", "compilation", "io.files"),
+    *("errors", "types", "units", "precision", "compilation", "published", "io.files"),
     *("machine", "loading_cycle", "presets"),
     *("ground", "pile.volumes", "pile.noise", "pile.seeds", "pile.resampling", "pile.outlines"),
     *("pile.toe", "pile"),
@@ -50,9 +50,10 @@ LAYERS = [
         "report",
     ),
     *("bench.timing", "bench.digs", "bench.baselines", "bench.setup", "bench.automata"),
-    *("bench.rollouts", "bench.planning", "bench.items", "bench"),
+    *("bench.inference", "bench.rollouts", "bench.planning", "bench.items", "bench"),
     *("cli.options", "cli.outputs", "cli.inputs", "cli.progress", "cli.played", "cli.engines"),
-    *("cli.planning", "cli.maps", "cli.gradients", "cli.learning", "cli.benchmark"),
+    *("cli.planning", "cli.maps", "cli.gradients", "cli.evaluated", "cli.learning"),
+    "cli.benchmark",
     *("cli", "__main__"),
 ]
 

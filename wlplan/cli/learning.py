@@ -24,6 +24,7 @@ from wlplan.cli.options import (
 from wlplan.cli.outputs import QUANTITIES, checked_folder, json_text, print_table, titled_table
 from wlplan.cli.progress import Progress, Stopwatch
 from wlplan.errors import InputError
+from wlplan.published import PILE_STATE
 
 # A data set of so many takes 32 GB.
 _MOST_CYCLES = 1_000_000
@@ -286,7 +287,7 @@ def train(
         return
     title = f"{kind}, held-out part of {', '.join(data)}"
     if kind.startswith("phi"):
-        _print_pile_state(title, [("", report.as_dict())])
+        _print_pile_state(title, [("ours", report.as_dict())])
     else:
         _print_errors(title, report.as_dict())
     print(f"training {training.text()}")
@@ -325,55 +326,41 @@ def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: b
     ),
 )
 def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
-    """Report the errors of a model on simulated cycles.
+    """Report the errors of a model on simulated cycles, and the time of an inference.
 
     Of the data set that it was trained on, only the part that was held out counts. The split
-    belongs to the model, so --seed changes nothing.
+    belongs to the model, so --seed changes nothing. What the paper reports of its model, on data of
+    its own simulator, stands beside.
     """
     check_is_folder(data, "data set", "wlplan collect")
     if model is not None:
         check_is_folder(model, "model", "wlplan train")
 
+    from wlplan.cli.evaluated import evaluated, print_times
     from wlplan.dataset import open_dataset
-    from wlplan.training import (
-        evaluate_performance,
-        evaluate_pile_state,
-        held_out,
-        load_model,
-        read_description,
-    )
+    from wlplan.training import held_out, load_model, read_description
     from wlplan.worlds import pretrained_path
 
     folder = pretrained_path("psi_low") if model is None else Path(model)
     description = read_description(folder, kind=None)
     predictor: Any = load_model(folder, description["kind"])
-    kind = description["kind"].replace("_", "-")
     dataset = open_dataset(data)
     part = held_out(dataset, description)
+    found = evaluated(predictor, part, description)
+    kind = description["kind"].replace("_", "-")
+    if as_json:
+        click.echo(json_text({"model": kind, "data": data, **found}))
+        return
     which = "held-out part" if len(part) < len(dataset) else "all cycles"
     title = f"{kind}, {which} of {data}"
     if kind.startswith("phi"):
-        # Of the paper's predictor also without its post-processing.
-        ways = {"": True} if kind == "phi" else {"edges blended": True, "as predicted": False}
-        rows = [
-            (name, evaluate_pile_state(predictor, part, blend=blend).as_dict())
-            for name, blend in ways.items()
-        ]
-        if as_json:
-            errors = rows[0][1] | ({"without_blending": rows[1][1]} if len(rows) > 1 else {})
-            click.echo(json_text({"model": kind, "data": data, "errors": errors}))
-        else:
-            _print_pile_state(title, rows)
-        return
-    report = evaluate_performance(predictor, part).as_dict()
-    if as_json:
-        click.echo(json_text({"model": kind, "data": data, "errors": report}))
-        return
-    _print_errors(title, report)
-
-
-# Table 2 of the paper: mean absolute [m³] and mean relative error.
-_PAPER = (("paper, edges blended", 0.75, 0.0304), ("paper, as predicted", 0.84, 0.0341))
+        without = found["errors"].get("without_blending")
+        ways = {"edges blended": found["errors"], "as predicted": without}
+        rows = {"ours": found["errors"]} if without is None else ways
+        _print_pile_state(title, list(rows.items()))
+    else:
+        _print_errors(title, found["errors"], found["paper"]["mean_relative"])
+    print_times(found["inference"], found["paper"]["inference_s"])
 
 
 def _print_pile_state(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
@@ -383,18 +370,23 @@ def _print_pile_state(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]])
         table.add_column(column, justify="left" if not column else "right")
     for name, errors in rows:
         table.add_row(
-            name or "ours",
+            name,
             str(errors["cycles"]),
             f"{errors['mean_absolute']:.3f} m³",
             f"{100.0 * errors['mean_relative']:.2f} %",
             f"{100.0 * errors['total_volume']:+.2f} %",
         )
-    for name, absolute, relative in _PAPER:
-        table.add_row(name, "", f"{absolute:.2f} m³", f"{100.0 * relative:.2f} %", "")
+    for blend, name in ((True, "paper, edges blended"), (False, "paper, as predicted")):
+        result = PILE_STATE[blend]
+        relative = f"{100.0 * result.mean_relative:.2f} %"
+        table.add_row(name, "", f"{result.mean_absolute:.2f} m³", relative, "")
     print_table(table)
 
 
-def _print_errors(title: str, report: Mapping[str, Any]) -> None:
+def _print_errors(
+    title: str, report: Mapping[str, Any], paper: Mapping[str, float] | None = None
+) -> None:
+    """Errors of a performance predictor, and the paper's on the paper's data."""
     table = titled_table(title)
     for column in ("", "cycles", "mass", "time", "work"):
         table.add_column(column, justify="left" if not column else "right")
@@ -416,4 +408,7 @@ def _print_errors(title: str, report: Mapping[str, Any]) -> None:
             str(report["every"]["cycles"]),
             *(f"{100.0 * part:.1f} %" for part in inside),
         )
+    if paper is not None:
+        cells = (f"{100.0 * paper[q]:.2f} %" for q in QUANTITIES)
+        table.add_row("paper: mean relative error, all cycles", "1072", *cells)
     print_table(table)

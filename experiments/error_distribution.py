@@ -1,0 +1,191 @@
+"""Where the performance predictors err: errors over what was loaded, and the worst predictions.
+
+Paper, figures 9 and 10: relative errors on held-out cycles, scattered over the simulated outcome,
+with moving averages and the distribution of the data; and the ten loads that ψ_low predicts worst,
+with the pile they were dug from.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from experiments.record import described, main
+from experiments.trained import PSI, SHORT, trained
+from wlplan.dataset import Dataset, split
+from wlplan.io import write_bytes_atomic
+from wlplan.machine import WA320
+from wlplan.plots import png_bytes
+from wlplan.plots.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
+from wlplan.training.evaluation import predict
+from wlplan.units import CELL_SIZE
+
+MODELS = ("psi_low, swish", "psi_high, swish")
+OUTCOMES = {"mass": "t", "time": "s", "work": "kJ"}
+WORST = 10
+# Part of the cycles in a window of the moving average.
+WINDOW = 0.05
+# Decrease and increase of the surface in the maps of the worst predictions [m].
+CHANGE = 0.5
+GOLD, CYAN = "#d9a400", "#00a0b8"
+
+
+def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
+    """Errors of every held-out cycle, and the maps of the worst."""
+    smoke = preset == "smoke"
+    test = split(data)[2]
+    test = test.select(test.valid & (test.mass > 0.0))
+    errors = {}
+    for title in MODELS:
+        model, _ = trained(models, data, **(PSI[title] | (SHORT if smoke else {})))
+        predicted = predict(model, test)
+        errors[title] = {
+            name: np.asarray(getattr(predicted, name)) / getattr(test, name) - 1.0
+            for name in OUTCOMES
+        }
+    worst = np.argsort(-np.abs(errors[MODELS[0]]["mass"]))[:WORST]
+    return {
+        "data": described(data),
+        "cycles": len(test),
+        "simulated": {
+            name: [float(f"{value:.4g}") for value in getattr(test, name)] for name in OUTCOMES
+        },
+        "error": {
+            title: {name: values.astype(float).round(3).tolist() for name, values in table.items()}
+            for title, table in errors.items()
+        },
+        "shares": {
+            title: {name: _shares(values) for name, values in table.items()}
+            for title, table in errors.items()
+        },
+        "worst": [
+            _worst(test, int(n), {t: e["mass"][n] for t, e in errors.items()}) for n in worst
+        ],
+        "skew": _skew(test, worst),
+    }
+
+
+def _shares(errors: Float[np.ndarray, " n"]) -> dict[str, float]:
+    """How the sizes of relative errors are spread."""
+    sizes = np.abs(errors)
+    half, most, nearly = (float(v) for v in np.percentile(sizes, [50.0, 90.0, 99.0]))
+    return {"mean": float(sizes.mean()), "median": half, "p90": most, "p99": nearly}
+
+
+def _worst(data: Dataset, n: int, errors: dict[str, Any]) -> dict[str, Any]:
+    """One prediction: errors, what was loaded, and its maps in centimetres."""
+    before, after = (np.rint(100.0 * maps[n]).astype(int) for maps in (data.h36, data.h36_after))
+    return {
+        "error": {title: float(f"{error:.4g}") for title, error in errors.items()},
+        **{name: float(f"{getattr(data, name)[n]:.4g}") for name in OUTCOMES},
+        "action": data.action[n].round(3).tolist(),
+        "stop_reason": int(data.stop_reason[n]),
+        "load": int(data.load[n]),
+        # Every other cell does for the contours.
+        "height_cm": before[::2, ::2].tolist(),
+        "change_cm": (after - before).tolist(),
+    }
+
+
+def _skew(data: Dataset, worst: np.ndarray) -> dict[str, float]:
+    """How one-sided the piles are: volume left over right of the centre line, as part of both."""
+    volume = np.clip(data.h36 - data.h36.min(axis=(1, 2), keepdims=True), 0.0, None)
+    left, right = volume[:, :, 18:].sum(axis=(1, 2)), volume[:, :, :18].sum(axis=(1, 2))
+    skew = np.abs(left - right) / np.maximum(left + right, 1e-9)
+    return {"worst_median": float(np.median(skew[worst])), "all_median": float(np.median(skew))}
+
+
+def draw(folder: Path) -> None:
+    """Figure 9 as error_distribution.png, figure 10 as worst_predictions.png."""
+    result = json.loads((folder / "error_distribution.json").read_text())
+    figure = new_figure(10.5, 3.1)
+    colours = dict(zip(result["error"], (BLUE, ORANGE), strict=True))
+    for panel, (name, unit) in zip(figure.subplots(1, 3), OUTCOMES.items(), strict=True):
+        outcome = np.array(result["simulated"][name])
+        low, high = np.percentile(outcome, [0.2, 99.8])
+        panel.set_xlim(low, high)
+        behind = panel.twinx()
+        behind.hist(outcome, bins=40, range=(low, high), color="#dfe2e6")
+        behind.set_yticks([])
+        panel.set_zorder(behind.get_zorder() + 1)
+        panel.patch.set_visible(False)
+        for side in behind.spines.values():
+            side.set_visible(False)
+        order = np.argsort(outcome)
+        for title, colour in colours.items():
+            error = 100.0 * np.abs(result["error"][title][name])
+            panel.plot(outcome, error, ".", ms=2.0, alpha=0.35, color=colour)
+            size = max(int(WINDOW * len(outcome)), 2)
+            window = np.ones(size) / size
+            mean = [np.convolve(v[order], window, "valid") for v in (outcome, error)]
+            label = f"{title.replace('psi', 'ψ')}, moving average"
+            panel.plot(*mean, color=colour, lw=1.8, label=label)
+        panel.set_ylim(0.0, 40.0)
+        panel.set_xlabel(f"simulated {name} [{unit}]", fontsize=9)
+        panel.set_title(f"size of the relative error of the {name} [%]", fontsize=9)
+        tidy(panel)
+        if name == "mass":
+            panel.legend(fontsize=8, frameon=False, loc="upper right")
+    told = "grey: distribution of the cycles; errors above 40 % not shown"
+    figure.suptitle(f"{result['cycles']} held-out cycles; {told}", fontsize=8, color=FAINT)
+    write_bytes_atomic(folder / "error_distribution.png", png_bytes(figure))
+    _draw_worst(result, folder)
+
+
+def _draw_worst(result: dict[str, Any], folder: Path) -> None:
+    """The ten worst predictions: contours of the pile, and where it rose or fell."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    colours = LinearSegmentedColormap.from_list("change", [GOLD, "#f6f4ee", CYAN])
+    figure = new_figure(11.0, 5.6)
+    panels = figure.subplots(2, 5, sharex=True, sharey=True).reshape(-1)
+    low, high = MODELS
+    for panel, item in zip(panels, result["worst"], strict=False):
+        height = 0.01 * np.array(item["height_cm"])
+        change = 0.01 * np.array(item["change_cm"])
+        along = np.arange(len(change)) * CELL_SIZE
+        # Left of the loader is left in the picture.
+        left = along - along.mean()
+        image = panel.pcolormesh(
+            -left,
+            along,
+            change,
+            cmap=colours,
+            vmin=-CHANGE,
+            vmax=CHANGE,
+        )
+        lines = panel.contour(
+            -left[::2], along[::2], height, np.arange(0.0, 4.0, 0.25), colors=INK, linewidths=0.6
+        )
+        panel.clabel(lines, lines.levels[::2], fontsize=5, fmt="%.1f")
+        for side in (-0.5, 0.5):
+            panel.axvline(side * WA320.bucket_width, color=FAINT, lw=0.7, ls="--")
+        panel.set_aspect("equal")
+        panel.set_title(
+            f"{item['mass']:.2f} t\nψ_low {100.0 * item['error'][low]:+.0f} %, "
+            f"ψ_high {100.0 * item['error'][high]:+.0f} %",
+            fontsize=8,
+        )
+        tidy(panel, grid=False)
+    for panel in panels[5:]:
+        panel.set_xlabel("to the right [m]", fontsize=8)
+    for panel in panels[::5]:
+        panel.set_ylabel("ahead of the dig location [m]", fontsize=8)
+    bar = figure.colorbar(image, ax=panels.tolist(), shrink=0.6, pad=0.01)
+    bar.set_label("change by the loading [m]", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+    figure.suptitle(
+        "The worst predictions of the mass by ψ_low: simulated mass and errors; contours: "
+        "height before over the dig location [m]; dashed: width of the bucket",
+        fontsize=8,
+        color=FAINT,
+    )
+    write_bytes_atomic(folder / "worst_predictions.png", png_bytes(figure))
+
+
+if __name__ == "__main__":
+    main("error_distribution", run, draw)

@@ -1,0 +1,199 @@
+"""What the experiments on trained models compute: floors, sums of errors, cosines, kept models."""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from test_training import synthetic
+
+from experiments import learning_curve, model_gradients, noise_floor, sequential_loading
+from experiments.trained import trained
+from wlplan import training
+from wlplan.dataset import fingerprint
+from wlplan.types import Performance
+from wlplan.units import CELL_SIZE
+
+# --- models that are kept
+
+
+def test_a_model_is_trained_once_and_found_again(tmp_path, monkeypatch):
+    data = synthetic(rollouts=10, loads=6)
+    settings = {"activation": "swish", "epochs": 1, "hidden": (4,)}
+    first, seconds = trained(tmp_path, data, "psi_low", **settings)
+    assert seconds > 0.0
+    with monkeypatch.context() as patched:
+        refuses = functools.wraps(training.train_psi_low)(lambda *_, **__: 1 / 0)
+        patched.setattr("wlplan.training.train_psi_low", refuses)
+        again, same = trained(tmp_path, data, "psi_low", **settings)
+    assert same == seconds
+    inputs = jnp.asarray(data.characteristics[0]), jnp.asarray(data.action[0])
+    assert first(*inputs).mass == again(*inputs).mass
+    trained(tmp_path, data, "psi_low", seed=1, **settings)
+    trained(tmp_path, data.select(data.rollout < 8), "psi_low", **settings)
+    train = training.train_psi_low
+
+    def with_another_default(dataset, *, learning_rate=1e-3, **others):
+        return train(dataset, learning_rate=learning_rate, **others)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("wlplan.training.train_psi_low", with_another_default)
+        trained(tmp_path, data, "psi_low", **settings)
+    names = [path.name for path in tmp_path.iterdir() if path.is_dir()]
+    assert len(names) == 4
+    assert sum(fingerprint(data)[7:15] in name for name in names) == 3
+
+
+def test_a_training_that_was_cut_short_has_no_time(tmp_path, monkeypatch):
+    data = synthetic(rollouts=10, loads=6)
+    settings = {"epochs": 1, "hidden": (4,)}
+    with monkeypatch.context() as patched:
+        fails = functools.wraps(training.train_psi_low)(lambda *_, **__: 1 / 0)
+        patched.setattr("wlplan.training.train_psi_low", fails)
+        with pytest.raises(ZeroDivisionError):
+            trained(tmp_path, data, "psi_low", **settings)
+    assert trained(tmp_path, data, "psi_low", **settings)[1] is None
+
+
+# --- learning curve
+
+
+def test_parts_of_the_learning_curve_are_drawn_without_repetition():
+    pool = synthetic(rollouts=30, loads=10)
+    part, settings = learning_curve._part(pool, 90, seed=0)
+    assert len(part) == 100
+    pairs = np.unique(np.column_stack([part.rollout, part.mass]), axis=0)
+    assert len(pairs) == 100
+    other, _ = learning_curve._part(pool, 90, seed=1)
+    assert fingerprint(part) != fingerprint(other)
+    assert settings["epochs"] == learning_curve.LEAST_STEPS
+    whole, _ = learning_curve._part(pool, 10_000, seed=0)
+    assert fingerprint(whole) == fingerprint(pool)
+
+
+# --- noise floor
+
+
+def test_the_floor_is_the_mean_deviation_of_what_cannot_be_told_apart():
+    random = np.random.default_rng(0)
+    mean = random.uniform(2.0, 4.0, (2000, 1, 3))
+    spread = np.array([0.0, 0.01, 0.05])
+    found = noise_floor.floor(mean * (1.0 + spread * random.normal(size=(2000, 12, 3))))
+    np.testing.assert_allclose(found, np.sqrt(2.0 / np.pi) * spread, rtol=0.03, atol=1e-12)
+
+
+def test_a_better_constant_lowers_the_floor():
+    # Three repeats of four agree: that value is the best, and errs on the fourth alone.
+    repeats = np.full((1, 4, 3), 2.0)
+    repeats[0, 3] = 4.0
+    np.testing.assert_allclose(noise_floor.floor(repeats), (0.5 / 4.0) * np.sqrt(4.0 / 3.0))
+
+
+def test_changes_around_the_map_leave_the_map_and_the_ground_alone():
+    slope = np.maximum(0.5 * (np.arange(52) * CELL_SIZE - 1.0), 0.0)
+    surface = np.broadcast_to(slope[None, :, None], (2, 52, 52))
+    changed = noise_floor.around(surface, 3, np.random.default_rng(0))
+    assert changed.shape == (2, 3, 52, 52)
+    inside = np.s_[..., 10:46, 8:44]
+    np.testing.assert_array_equal(changed[inside], surface[:, None][inside].repeat(3, axis=1))
+    np.testing.assert_array_equal(changed[..., :10, :], 0.0)
+    assert np.abs(changed - surface[:, None]).max() > 0.05
+    assert np.abs(changed[:, 0] - changed[:, 1]).max() > 0.05
+
+
+# --- forty loads
+
+
+@struct.dataclass
+class TakesOne:
+    """A world that says what it is told, and lowers every cell."""
+
+    factor: float
+
+    def __call__(self, pile, pose, action):
+        """The pose scaled as mass, time and work."""
+        told = Performance(self.factor * pose.x, self.factor * pose.y, self.factor * pose.heading)
+        return pile.replace(height=pile.height - 0.1 * self.factor), told
+
+
+def sequence(loads=4, cells=5):
+    random = np.random.default_rng(0)
+    outcomes = random.uniform(1.0, 2.0, (loads, 3))
+    steps = 0.1 * np.arange(loads + 1)
+    return sequential_loading.Sequence(
+        kind=0,
+        origin=np.zeros(2),
+        poses=outcomes,
+        actions=np.zeros((loads, 4)),
+        outcomes=outcomes,
+        heights=np.broadcast_to(3.0 - steps[:, None, None], (loads + 1, cells, cells)),
+    )
+
+
+@pytest.mark.parametrize("own_pile", [True, False])
+def test_the_right_world_has_no_error(own_pile):
+    played = sequence()
+    found = sequential_loading.predicted(TakesOne(1.0), played, own_pile=own_pile)
+    np.testing.assert_allclose(found[0], played.outcomes, rtol=1e-6)
+    np.testing.assert_allclose(found[1], played.volumes[1:], rtol=1e-6)
+    np.testing.assert_allclose(found[2], 0.0, atol=1e-5)
+
+
+def test_errors_of_a_wrong_world_add_up():
+    played = sequence()
+    found = sequential_loading.predicted(TakesOne(1.2), played, own_pile=True)
+    truth = played.outcomes[None]
+    growth = sequential_loading._growth([found], truth, played.volumes[None])
+    for name in sequential_loading.OUTCOMES:
+        assert growth[name]["last"]["mean"] == pytest.approx(0.2, rel=1e-4)
+    # 0.08 m too much were taken, of 2.6 m that should be left.
+    assert growth["volume"]["last"]["mean"] == pytest.approx(-0.08 / 2.6, rel=1e-4)
+    np.testing.assert_allclose(found[2][-1], 0.08 * 25 * CELL_SIZE**2, rtol=1e-4)
+    # On the simulator's pile only the last load is misplaced, the volumes add up all the same.
+    given = sequential_loading.predicted(TakesOne(1.2), played, own_pile=False)
+    np.testing.assert_allclose(given[2], 0.02 * 25 * CELL_SIZE**2, rtol=1e-3)
+    np.testing.assert_allclose(given[1], found[1], rtol=1e-5)
+    assert sequential_loading._sizes([found], truth)["work"] == pytest.approx(0.2, rel=1e-4)
+
+
+def test_errors_that_cancel_in_the_sum_still_have_a_size():
+    played = sequence()
+    wrong = played.outcomes + np.array([0.1, -0.1, 0.1, -0.1])[:, None]
+    found = (wrong, played.volumes[1:], np.zeros(4))
+    growth = sequential_loading._growth([found], played.outcomes[None], played.volumes[None])
+    assert growth["mass"]["last"]["mean"] == pytest.approx(0.0, abs=1e-9)
+    assert sequential_loading._sizes([found], played.outcomes[None])["mass"] > 0.05
+
+
+# --- gradients
+
+
+def test_the_summary_of_cosines_counts_what_points_nowhere():
+    random = np.random.default_rng(0)
+    truth = random.normal(size=(100, 4))
+    same = model_gradients.summary(2.0 * truth, truth)
+    assert same["median"] == pytest.approx(1.0)
+    assert same["positive"] == 1.0
+    assert same["median_length_ratio"] == pytest.approx(2.0)
+    wrong = truth.copy()
+    wrong[:20] *= -1.0
+    wrong[20:30] = 0.0
+    truth[99] = 0.0
+    some = model_gradients.summary(wrong, truth)
+    assert some["cycles"] == 99
+    assert some["positive"] == pytest.approx(69 / 99)
+    assert some["p10"] == pytest.approx(-1.0)
+
+
+def test_derivatives_are_turned_into_the_frame_of_the_pose():
+    """Of f = 2 ahead + 3 aside, at a pose that looks along 30 degrees."""
+    heading = np.radians(30.0)
+    ahead, aside = (np.cos(heading), np.sin(heading)), (-np.sin(heading), np.cos(heading))
+    world = np.zeros((1, 3, 7))
+    world[0, :, :2] = 2.0 * np.array(ahead) + 3.0 * np.array(aside)
+    world[0, :, 2:] = 5.0
+    vector = np.array([[1.0, 2.0, heading, 0.0, 0.0, 0.0, 0.0]])
+    found = model_gradients._in_its_frame(world, vector)
+    np.testing.assert_allclose(found[0, :, :2], [[2.0, 3.0]] * 3)
+    np.testing.assert_array_equal(found[0, :, 2:], 5.0)
