@@ -11,6 +11,7 @@ import functools
 import itertools
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
@@ -140,9 +141,11 @@ class Mlp(nnx.Module):
         if self.scatter is None:
             raise InputError("This network does not tell how far it may be off: train an ensemble.")
         x = self._hidden(inputs, rngs)
-        # Bounded, so that no step of the training can make it overflow.
-        exponent = _LARGEST_EXPONENT * jnp.tanh(self.scatter(x) / _LARGEST_EXPONENT)
-        return self._restored(self.output(x)), _USUAL_VARIANCE * jnp.exp(exponent)
+        # What tells the scatter must not make the hidden layers worse at telling the outputs. Bounded,
+        # so that no step of the training can make it overflow.
+        exponent = self.scatter(jax.lax.stop_gradient(x)) / _LARGEST_EXPONENT
+        variances = _USUAL_VARIANCE * jnp.exp(_LARGEST_EXPONENT * jnp.tanh(exponent))
+        return self._restored(self.output(x)), variances
 
     def _hidden(self, inputs: Array, rngs: nnx.Rngs | None) -> Array:
         x = inputs if self.scale_in is None else self.scale_in.standardise(inputs)

@@ -23,10 +23,10 @@ from wlplan.training.fitting import Recipe, mirror_some, of_errors
 from wlplan.training.session import Session
 from wlplan.types import PyTree
 
-# Weight of the likelihood of the errors in the loss of a member. The error itself counts there as
-# given, so that the likelihood does not lead the network to give up on what scatters much: trained
-# by likelihood alone, members erred by 9.7 % in work in place of 5.7 %. This is the idea of Stirn
-# et al. (2023), with the hidden layers shared.
+# Weight of the likelihood of the errors in the loss of a member. The error itself and the hidden
+# layers count there as given (Stirn et al. 2023), so that the likelihood does not lead the network
+# to give up on what scatters much: trained by likelihood alone, members erred by 9.7 % in work in
+# place of 5.7 %.
 _SCATTER = 0.1
 
 
