@@ -141,8 +141,8 @@ class Mlp(nnx.Module):
         if self.scatter is None:
             raise InputError("This network does not tell how far it may be off: train an ensemble.")
         x = self._hidden(inputs, rngs)
-        # What tells the scatter must not make the hidden layers worse at telling the outputs. Bounded,
-        # so that no step of the training can make it overflow.
+        # What tells the scatter must not make the hidden layers worse at telling the outputs.
+        # Bounded, so that no step of the training can make it overflow.
         exponent = self.scatter(jax.lax.stop_gradient(x)) / _LARGEST_EXPONENT
         variances = _USUAL_VARIANCE * jnp.exp(_LARGEST_EXPONENT * jnp.tanh(exponent))
         return self._restored(self.output(x)), variances

@@ -17,8 +17,8 @@ from wlplan.training.storage import load_model, read_description
 CYCLES = 10_800
 """Loading cycles that are collected where there is no data set: about as many as the paper's."""
 
-# Of each model its training, and how. Members of 128 or 256 units are as good as of 512, and five of
-# them take about as long to ask as one of those.
+# Of each model its training, and how. Members of 128 or 256 units are as good as of 512, and five
+# of them take about as long to ask as one of those.
 _TRAININGS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "psi_low": (
         train_psi_low,
