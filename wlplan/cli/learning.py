@@ -311,7 +311,7 @@ def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: b
     for kind, report in reports.items():
         title = f"{kind.replace('_', '-')}, held-out part of {data}"
         if kind == "phi":
-            _print_pile_state(title, [("", report)])
+            _print_pile_state(title, [("ours", report)])
         else:
             _print_errors(title, report)
     print(f"training {training.text()}")
