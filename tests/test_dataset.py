@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import errno
 import functools
+import importlib.machinery
 import itertools
 import json
 import math
@@ -15,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -931,3 +933,12 @@ def test_the_normaliser_maps_the_range_to_one_and_back():
     np.testing.assert_array_equal(unit[:, 3], 0.0)
     back = np.stack([normaliser.denormalise(jnp.asarray(row)) for row in unit])
     np.testing.assert_allclose(back, table, rtol=1e-5)
+
+
+def test_the_command_is_one_to_type_again(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["/somewhere/bin/wlplan", "collect", "--out", "my data.zarr"])
+    main = types.ModuleType("__main__")
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    assert stored.command() == "wlplan collect --out 'my data.zarr'"
+    main.__spec__ = importlib.machinery.ModuleSpec("wlplan.__main__", None)
+    assert stored.command() == "python -m wlplan collect --out 'my data.zarr'"

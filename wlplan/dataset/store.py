@@ -225,7 +225,10 @@ def update_attributes(path: Path, changes: Mapping[str, Any]) -> None:
 
 def command() -> str:
     """The words that this process was started with."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    # Run by `python -m`, a module has a name, and a package is named by its `__main__`.
+    module = [] if spec is None else ["python", "-m", spec.name.removesuffix(".__main__")]
+    return shlex.join([*(module or [Path(sys.argv[0]).name]), *sys.argv[1:]])
 
 
 def versions() -> dict[str, str]:

@@ -7,9 +7,7 @@ import hashlib
 import json
 import os
 import secrets
-import shlex
 import shutil
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from wlplan.dataset import versions
+from wlplan.dataset.store import command, versions
 from wlplan.errors import InputError
 from wlplan.heightmap import (
     PERFORMANCE_CELLS,
@@ -138,7 +136,7 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
                 },
                 "grid": GRID,
                 **({"ensemble": _ensemble_to_dict(model)} if isinstance(model, Ensemble) else {}),
-                "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+                "command": command(),
                 "versions": versions(),
                 **meta,
                 "files": _digests(beside / _WEIGHTS),
