@@ -29,7 +29,7 @@ from wlplan.units import ACTION_HIGH
 from wlplan.worlds import HybridWorld, LowWorld
 
 MEMBERS = 5
-LIGHT = {"epochs": 30, "batch": 64, "hidden": (32,), "learning_rate": 1e-2, "members": MEMBERS}
+LIGHT = {"epochs": 30, "batch": 64, "hidden": (128,), "learning_rate": 1e-2, "members": MEMBERS}
 ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
 
 

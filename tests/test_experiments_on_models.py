@@ -8,7 +8,13 @@ import pytest
 from flax import struct
 from test_training import synthetic
 
-from experiments import learning_curve, model_gradients, noise_floor, sequential_loading
+from experiments import (
+    learning_curve,
+    model_gradients,
+    noise_floor,
+    reliability,
+    sequential_loading,
+)
 from experiments.trained import trained
 from wlplan import training
 from wlplan.dataset import fingerprint
@@ -197,3 +203,19 @@ def test_derivatives_are_turned_into_the_frame_of_the_pose():
     found = model_gradients._in_its_frame(world, vector)
     np.testing.assert_allclose(found[0, :, :2], [[2.0, 3.0]] * 3)
     np.testing.assert_array_equal(found[0, :, 2:], 5.0)
+
+
+# --- reliability
+
+
+def test_deviations_that_are_right_cover_as_they_say_and_others_do_not():
+    random = np.random.default_rng(0)
+    deviation = random.uniform(0.1, 2.0, 20_000)
+    error = deviation * random.normal(size=len(deviation))
+    right = reliability.reliability(error, deviation)
+    np.testing.assert_allclose(right["coverage"], reliability.LEVELS, atol=0.01)
+    np.testing.assert_allclose(right["error"], right["deviation"], rtol=0.06)
+    np.testing.assert_allclose(right["inside"], 0.9, atol=0.03)
+    # Half as large, the interval of 90 % is one of 59 %.
+    small = reliability.reliability(error, 0.5 * deviation)
+    assert small["coverage"][reliability.LEVELS.index(0.9)] == pytest.approx(0.589, abs=0.01)

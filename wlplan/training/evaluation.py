@@ -87,7 +87,7 @@ def evaluate_performance(
         raise InputError(
             f"No cycle has a load of {_LOADED:g} t or more: there is nothing to evaluate on."
         )
-    predicted, deviation = _predicted(model, dataset)
+    predicted, deviation = predict_with_deviation(model, dataset)
     by_name = {name: np.asarray(getattr(predicted, name)) for name in QUANTITIES}
 
     def errors(which: np.ndarray) -> Errors:
@@ -137,7 +137,7 @@ def widening(ensemble: Ensemble, dataset: Dataset) -> Float[Array, "3"]:
         ensemble: Ensemble whose own factors are one.
         dataset: Cycles that its members were not trained on.
     """
-    predicted, deviation = _predicted(ensemble, dataset)
+    predicted, deviation = predict_with_deviation(ensemble, dataset)
     assert deviation is not None
     factors = []
     for name in QUANTITIES:
@@ -151,13 +151,13 @@ def predict(
     model: PerformanceModel | HighPerformanceModel | Ensemble, dataset: Dataset
 ) -> Performance:
     """The performance that a model predicts for each cycle; leaves of shape [n]."""
-    return _predicted(model, dataset)[0]
+    return predict_with_deviation(model, dataset)[0]
 
 
-def _predicted(
+def predict_with_deviation(
     model: PerformanceModel | HighPerformanceModel | Ensemble, dataset: Dataset
 ) -> tuple[Performance, Performance | None]:
-    """Prediction of each cycle and, by an ensemble, its standard deviation."""
+    """Prediction of each cycle and, by an ensemble, its standard deviation; leaves of shape [n]."""
     network = model.members if isinstance(model, Ensemble) else model
     if isinstance(network, PerformanceModel):
         return _of_views(model, jnp.asarray(dataset.characteristics), jnp.asarray(dataset.action))
