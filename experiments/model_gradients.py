@@ -8,7 +8,6 @@ model in pose and action and central differences of the simulator.
 from __future__ import annotations
 
 import json
-import math
 import sys
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-import wlplan
 from experiments.record import described, main
 from experiments.simulator_gradients import (
     LINE,
@@ -32,8 +30,9 @@ from experiments.simulator_gradients import (
     SCALE,
     SEED,
     UNITS,
-    _cases,
-    _played,
+    random_cases,
+    replayed,
+    site_of_the_line,
 )
 from experiments.trained import PSI, SHORT, trained
 from wlplan.characteristics import as_vector, characteristics
@@ -72,7 +71,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
         for title in MODELS
     }
     with jax.enable_x64(True):
-        cases = _cases(1 if smoke else ROLLOUTS, 2 if smoke else LOADS)
+        cases = random_cases(1 if smoke else ROLLOUTS, 2 if smoke else LOADS)
         differences = _differences(cases)
         rows = {
             title: _agreement(_jacobians(model, cases), differences)
@@ -147,7 +146,7 @@ def _differences(
     shifts = np.concatenate([sign * w * np.diag(UNITS) for w in widths for sign in (1, -1)])
     tables = []
     for n, (height, origin, vector) in enumerate(zip(*cases, strict=True), 1):
-        values = _played(height, origin, vector + shifts)[0].T
+        values = replayed(height, origin, vector + shifts)[0].T
         ahead, behind = np.moveaxis(values.reshape(3, len(widths), 2, 7), 2, 0)
         tables.append((ahead - behind) / (2.0 * widths[:, None]))
         if n % 20 == 0:
@@ -198,11 +197,7 @@ def summary(
 
 def _line(models: dict[str, Any], points: int) -> dict[str, Any]:
     """Values and derivatives along the line of actions at one pose: models and simulator."""
-    slope = math.radians(LINE_SLOPE_DEGREES)
-    pile = wlplan.relax(wlplan.seed_pile(LINE_KIND, slope=slope, seed=SEED))
-    toe = wlplan.toe_contour(pile)
-    at = int(np.flatnonzero(toe.accessible)[0])
-    pose = np.array([*toe.points[at], toe.heading[at]])
+    pile, pose = site_of_the_line()
     place = np.linspace(0.0, 1.0, points)
     actions = LINE[0] + place[:, None] * (LINE[1] - LINE[0])
     vectors = np.concatenate([np.tile(pose, (points, 1)), actions], axis=1)
@@ -227,7 +222,7 @@ def _line(models: dict[str, Any], points: int) -> dict[str, Any]:
         ]
         values, jacobians = (np.array([np.asarray(part[k]) for part in parts]) for k in (0, 1))
         curves[title] = scaled(values, jacobians[:, :, 3:] @ (LINE[1] - LINE[0]))
-    values, _ = _played(height, origin, vectors)
+    values, _ = replayed(height, origin, vectors)
     curves["simulator"] = scaled(values, np.gradient(values, place, axis=0))
     return {
         "pile": {"kind": LINE_KIND, "slope_degrees": LINE_SLOPE_DEGREES, "seed": SEED},

@@ -53,7 +53,7 @@ def run(preset: str) -> dict[str, Any]:
     """Cosines between gradients and differences, and the line."""
     smoke = preset == "smoke"
     with jax.enable_x64(True):
-        cases = _cases(1 if smoke else ROLLOUTS, 2 if smoke else LOADS)
+        cases = random_cases(1 if smoke else ROLLOUTS, 2 if smoke else LOADS)
         return {
             "step_units": UNITS.tolist(),
             "steps": STEPS,
@@ -62,7 +62,7 @@ def run(preset: str) -> dict[str, Any]:
         }
 
 
-def _cases(rollouts: int, loads: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def random_cases(rollouts: int, loads: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Piles as they are before random loadings in a row, their origins, and pose and action."""
     simulator = Simulator()
     play = jax.jit(lambda pile, pose, action: simulator(pile, pose, action)[0].height)
@@ -110,7 +110,7 @@ def _values(height: Array, origin: Array, vector: Array) -> tuple[Array, Array]:
     return _outcomes(Settings(), height, origin, vector)
 
 
-def _played(
+def replayed(
     height: np.ndarray, origin: np.ndarray, vectors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """`_values` of any number of loadings, in batches of one size."""
@@ -141,7 +141,7 @@ def _compared(cases: tuple[np.ndarray, np.ndarray, np.ndarray]) -> _Compared:
     for n, (height, origin, vector) in enumerate(zip(*cases, strict=True), 1):
         jacobian = _jacobian(*map(jnp.asarray, (height, origin, vector)))
         reverse.append(np.asarray(jacobian) * UNITS)
-        value, reason = _played(height, origin, vector + shifts)
+        value, reason = replayed(height, origin, vector + shifts)
         values.append(value.T)
         reasons.append(int(reason[0]))
         if n % 20 == 0:
@@ -220,13 +220,19 @@ def _summary(reverse: np.ndarray, central: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _line(points: int) -> dict[str, Any]:
-    """Values and derivatives along the line of actions, at one pose."""
+def site_of_the_line() -> tuple[wlplan.Pile, np.ndarray]:
+    """The pile of the line of actions, and where it is dug: x, y [m], heading [rad]."""
     slope = math.radians(LINE_SLOPE_DEGREES)
     pile = wlplan.relax(wlplan.seed_pile(LINE_KIND, slope=slope, seed=SEED))
     toe = wlplan.toe_contour(pile)
     at = int(np.flatnonzero(toe.accessible)[0])
     pose = np.array([*toe.points[at], toe.heading[at]])
+    return pile, pose
+
+
+def _line(points: int) -> dict[str, Any]:
+    """Values and derivatives along the line of actions, at one pose."""
+    pile, pose = site_of_the_line()
     place = np.linspace(0.0, 1.0, points)
 
     height, origin = (np.asarray(part, np.float64) for part in (pile.height, pile.origin))
@@ -241,7 +247,7 @@ def _line(points: int) -> dict[str, Any]:
     derivative = jacobians[:, :, 3:] @ (LINE[1] - LINE[0])
     step = STEPS["narrow"]
     every = np.concatenate([along(at) for at in (place, place + step, place - step)])
-    outcomes, events = _played(height, origin, every)
+    outcomes, events = replayed(height, origin, every)
     values, ahead, behind = np.split(outcomes, 3)
     central = (ahead - behind) / (2.0 * step)
     error = np.abs(derivative - central)

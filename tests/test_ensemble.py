@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from trainings import check_that_a_killed_one_ends_alike
 
 import wlplan
 from wlplan.automaton import relax
@@ -166,35 +167,11 @@ def test_a_record_that_does_not_fit_is_refused(saved, tmp_path, change):
 
 @pytest.mark.slow
 def test_a_killed_training_of_an_ensemble_ends_with_the_same_weights(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(fitting, "_SAVE_EVERY", 0.0)
     settings = {**LIGHT, "epochs": 4, "hidden": (8,), "dropout": 0.1, "members": 3}
     few = data.select(data.rollout < 12)
-    whole, _ = train_psi_low(few, out=tmp_path / "whole", **settings)
-
-    class KilledError(Exception):
-        pass
-
-    def killed(done, _):
-        if done == 2:
-            raise KilledError
-
-    with pytest.raises(KilledError):
-        train_psi_low(few, out=tmp_path / "m", progress=killed, **settings)
-    seen = []
-    resumed, _ = train_psi_low(
-        few, out=tmp_path / "m", progress=lambda *n: seen.append(n), **settings
+    check_that_a_killed_one_ends_alike(
+        train_psi_low, few, tmp_path, monkeypatch, settings, {"members": 2}
     )
-    assert seen == [(3, 4), (4, 4)]
-    for got, want in zip(jax.tree.leaves(resumed), jax.tree.leaves(whole), strict=True):
-        np.testing.assert_array_equal(got, want)
-
-    # With another number of members nothing is taken over.
-    with pytest.raises(KilledError):
-        train_psi_low(few, out=tmp_path / "m", progress=killed, **settings)
-    seen.clear()
-    fewer = {**settings, "members": 2}
-    train_psi_low(few, out=tmp_path / "m", progress=lambda *n: seen.append(n), **fewer)
-    assert len(seen) == 4
 
 
 def test_members_have_seeds_of_their_own_and_the_first_has_that_of_the_recipe():

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
+from trainings import check_that_a_killed_one_ends_alike
 
 from wlplan.automaton import relax
 from wlplan.dataset import VARIABLES, Dataset
@@ -20,7 +21,7 @@ from wlplan.models.performance_high import (
     PsiHigh,
 )
 from wlplan.pile import seed_pile, toe_contour
-from wlplan.training import fitting, load_model, read_description, train_psi_high
+from wlplan.training import load_model, read_description, train_psi_high
 from wlplan.types import LocalHeightmap, action_from
 from wlplan.worlds import load_world
 
@@ -214,33 +215,7 @@ def test_training_reads_the_map_and_a_model_comes_back_bit_by_bit(tmp_path):
 
 @pytest.mark.parametrize("encoder", ENCODERS)
 def test_a_killed_training_ends_with_the_same_weights(encoder, tmp_path, monkeypatch):
-    monkeypatch.setattr(fitting, "_SAVE_EVERY", 0.0)
-    data = cycles(rollouts=12)
     settings = {**SETTINGS, "encoder": encoder, "dropout": 0.1, "epochs": 4}
-    whole, _ = train_psi_high(data, out=tmp_path / "whole", **settings)
-
-    class KilledError(Exception):
-        pass
-
-    def killed(done, _):
-        if done == 2:
-            raise KilledError
-
-    with pytest.raises(KilledError):
-        train_psi_high(data, out=tmp_path / "m", progress=killed, **settings)
-    assert (tmp_path / ".m.training.npz").exists()
-    seen = []
-    resumed, _ = train_psi_high(
-        data, out=tmp_path / "m", progress=lambda *n: seen.append(n), **settings
+    check_that_a_killed_one_ends_alike(
+        train_psi_high, cycles(rollouts=12), tmp_path, monkeypatch, settings, {"seed": 1}
     )
-    assert seen == [(3, 4), (4, 4)]
-    for got, want in zip(jax.tree.leaves(resumed), jax.tree.leaves(whole), strict=True):
-        np.testing.assert_array_equal(got, want)
-
-    # Of other settings nothing is taken over.
-    with pytest.raises(KilledError):
-        train_psi_high(data, out=tmp_path / "m", progress=killed, **settings)
-    seen.clear()
-    other = {**settings, "seed": 1}
-    train_psi_high(data, out=tmp_path / "m", progress=lambda *n: seen.append(n), **other)
-    assert len(seen) == 4
