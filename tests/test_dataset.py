@@ -304,9 +304,39 @@ def test_a_corridor_is_dug_on_where_it_was_dug_before(worker):
         np.testing.assert_array_equal(one[0], other[0])
 
 
+def test_slow_loadings_are_followed_by_ones_with_similar_actions(worker):
+    def played(protocol):
+        finished = []
+        session, numbers = crew.Session(Simulator(), SEED, 20, 20, protocol), iter([0, 1, 2])
+        worker.play(session, lambda: next(numbers, None), finished.append)
+        return sorted(played for played in finished if played is not None)
+
+    similar = other = 0
+    for mine, papers in zip(played("slow"), played("paper"), strict=True):
+        slow = np.flatnonzero(mine.records["fill_time"] >= protocol._SLOW_FILLING)
+        first = slow[0] if len(slow) else 19
+        # Up to the first slow one everything is as in the paper's protocol.
+        for name in ("action", "pose", "mass"):
+            np.testing.assert_array_equal(
+                mine.records[name][: first + 1], papers.records[name][: first + 1]
+            )
+        for k in range(first + 1, 20):
+            last = mine.records["action"][slow[slow < k][-1]]
+            step = (mine.records["action"][k] - last) / np.subtract(ACTION_HIGH, ACTION_LOW)
+            new = papers.records["action"][k]
+            if np.array_equal(mine.records["action"][k], new):
+                other += 1
+            else:
+                similar += 1
+                assert np.abs(step).max() < 5 * protocol._SIMILAR
+        assert (mine.records["action"] >= np.float32(ACTION_LOW)).all()
+        assert (mine.records["action"] <= np.float32(ACTION_HIGH)).all()
+    assert similar > other > 0
+
+
 def test_a_protocol_is_part_of_what_a_data_set_is(copy):
     refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="corridor"), "protocol")
-    refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="other"), "paper, corridor")
+    refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="other"), "paper, corridor, slow")
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30, 31, 47, 449, 451, 1801, 10_718, 10_800])

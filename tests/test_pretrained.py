@@ -123,7 +123,7 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(tmp_path,
     )
     monkeypatch.setattr(weights, "collect", collect)
     monkeypatch.setattr(weights, "open_dataset", lambda path: few)
-    monkeypatch.setattr(weights, "is_new", lambda path: len(collected) < 2)
+    monkeypatch.setattr(weights, "is_new", lambda path: len(collected) < 5)
     monkeypatch.setattr(weights, "read_attributes", lambda path: {"cycles": 1, "cycles_done": 1})
 
     def trainer(kind, fails):
@@ -148,13 +148,14 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(tmp_path,
     with pytest.raises(KeyboardInterrupt):
         train_all(tmp_path / "d.zarr", tmp_path / "out", **call)
     reports = train_all(tmp_path / "d.zarr", tmp_path / "out", **call)
-    cycles = weights.CYCLES
-    assert collected == [
-        ("d.zarr", cycles, 3, "paper"),
-        ("d-corridor.zarr", cycles, 4, "corridor"),
+    assert collected[:2] == [
+        ("d.zarr", 10_800, 3, "paper"),
+        ("d-corridor.zarr", 10_800, 4, "corridor"),
     ]
+    # No two data sets share their piles, or their place.
+    assert len({name for name, *_ in collected}) == len({seed for *_, seed, _ in collected}) == 5
     assert trained == [("psi_low", 3), "broke", ("psi_high", 3), ("phi", 3)]
-    assert told[0] == ("cycles, protocol paper", cycles, cycles)
+    assert told[0] == ("cycles, d.zarr", 10_800, 10_800)
     assert set(reports) == set(SHIPPED)
     train_all(tmp_path / "d.zarr", tmp_path / "out", **call)
     assert len(trained) == 4

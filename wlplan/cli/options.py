@@ -19,7 +19,7 @@ PLANNERS = ("gradient", "greedy", "nominal")
 OBJECTIVES = ("efficiency", "productivity", "energy")
 ACTIVATIONS = ("swish", "leaky_relu")
 ENCODERS = ("convolutional", "principal")
-PROTOCOLS = ("paper", "corridor")
+PROTOCOLS = ("paper", "corridor", "slow")
 LOSSES = ("huber", "squared")
 
 BUNDLED = "bundled"

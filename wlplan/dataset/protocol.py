@@ -27,14 +27,19 @@ _BATCH = 60
 # Largest deviation of the heading from the normal of the toe [rad]. Paper, section 6.2.
 _HEADING_SPREAD = math.radians(10.0)
 # What the random streams are for; part of their keys.
-_ROLLOUT_STREAM, _ACTION_STREAM, _CORRIDOR_STREAM = 0, 1, 2
+_ROLLOUT_STREAM, _ACTION_STREAM, _CORRIDOR_STREAM, _SLOW_STREAM = 0, 1, 2, 3
 # A corridor: part of the loadings that stay near the one before, and how near they stay, the
 # standard deviation of either coordinate [m].
 _STAY, _NEAR = 0.85, 0.5
+# Slow loadings: from which filling time [s] (a tenth of all), part of the loadings after one whose
+# action is similar, and how similar, the standard deviation of each parameter over its range.
+_SLOW_FILLING, _REPEAT, _SIMILAR = 4.0, 0.8, 0.1
 
-PROTOCOLS = ("paper", "corridor")
-"""Where a rollout digs: anywhere along the toe, as in the paper's section 6.2, or on where it dug
-before, as plans do: so corridors come about, and what stands between them."""
+PROTOCOLS = ("paper", "corridor", "slow")
+"""How a rollout goes on. "paper": anywhere along the toe with any action, as in section 6.2.
+"corridor": mostly near where it dug before, as plans do: so corridors come about, and what stands
+between them. "slow": anywhere, mostly with an action like that of the last slow filling: so there
+are far more loadings that stall, or nearly do, than the paper's few in a hundred."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,6 +147,14 @@ class Rollout:
             stays = random.random(length) < _STAY
             stays[0] = False
             self.shift = np.where(stays[:, None], random.normal(0.0, _NEAR, (length, 2)), np.nan)
+        # Of every loading, what its action differs by from the last slow one's; NaN: in everything.
+        self.variation = np.full((length, 4), np.nan)
+        if protocol == "slow":
+            key = np.random.SeedSequence(seed, spawn_key=(_SLOW_STREAM, number))
+            random = np.random.default_rng(key)
+            repeats = random.random(length) < _REPEAT
+            drawn = random.normal(0.0, _SIMILAR, (length, 4))
+            self.variation = np.where(repeats[:, None], drawn, np.nan)
         key = np.random.SeedSequence(seed, spawn_key=(_ACTION_STREAM, repeat))
         unit = latin_hypercube(len(SEED_PILES) * length, 4, np.random.default_rng(key))
         low, high = np.array(ACTION_LOW), np.array(ACTION_HIGH)
@@ -175,6 +188,12 @@ class Rollout:
         self.valid = pose is not None
         # A pile that is used up is dug where it was dug last; `valid` tells.
         self.pose = self.pose if pose is None else pose
+        slow = [load["action"] for load in self.played if load["fill_time"] >= _SLOW_FILLING]
+        variation = self.variation[self.load]
+        if slow and not np.isnan(variation).any():
+            low, high = np.array(ACTION_LOW), np.array(ACTION_HIGH)
+            similar = np.clip(slow[-1] + (high - low) * variation, low, high)
+            self.action[self.load] = similar.astype(np.float32)
         return self.pose, self.action[self.load]
 
     def take_in(self, height: Array, record: dict[str, Any]) -> None:

@@ -245,5 +245,5 @@ def _mean_loss(
 def _finished(session: Session, model: Any, members: int) -> tuple[Any, EvaluationReport]:
     if members > 1:
         unfitted = Ensemble(model, factor=jnp.ones(3))
-        model = unfitted.replace(factor=widening(unfitted, session.parts[1]))
+        model = unfitted.replace(factor=widening(unfitted, session.validation))
     return model, session.finish(model, evaluate_performance)

@@ -46,8 +46,10 @@ class Session:
         tables: Arrays of a part of the data that the training looks at.
 
     Attributes:
-        parts: Training, validation and test part.
+        cycles: Number of cycles of the training, the validation and the test part.
         tables: Arrays of each part, by name.
+        validation: Cycles of the validation part.
+        test: Cycles of the test part.
 
     Raises:
         InputError: If the data set is too small or not finite, or the directory cannot be one of
@@ -65,12 +67,22 @@ class Session:
         if self._out is not None:
             check_target(self._out)
         datasets = [dataset] if isinstance(dataset, Dataset) else list(dataset)
-        splits = [split(each, fractions=_FRACTIONS) for each in datasets]
-        joined = [join(parts) for parts in zip(*splits, strict=True)]
-        self.parts = [part.select(part.valid) for part in joined]
-        if not all(len(part) for part in self.parts):
+        # Of the training parts only the tables are kept, which are a fraction of it.
+        rows: list[list[Mapping[str, np.ndarray]]] = []
+        self.cycles = [0, 0, 0]
+        used = []
+        for each in datasets:
+            parts = [part.select(part.valid) for part in split(each, fractions=_FRACTIONS)]
+            rows.append([tables(part) for part in parts])
+            self.cycles = [n + len(part) for n, part in zip(self.cycles, parts, strict=True)]
+            used.append(parts[1:])
+        self.validation, self.test = (join(parts) for parts in zip(*used, strict=True))
+        if not all(self.cycles):
             raise InputError("The data set has too few valid cycles to split: collect more cycles.")
-        self.tables = [tables(part) for part in self.parts]
+        self.tables = [
+            {name: np.concatenate([table[name] for table in part]) for name in part[0]}
+            for part in zip(*rows, strict=True)
+        ]
         if not all(np.isfinite(v).all() for table in self.tables for v in table.values()):
             raise InputError("The data set holds numbers that are not finite: collect it again.")
         self._recipe = recipe
@@ -134,13 +146,13 @@ class Session:
         Raises:
             InputError: If it cannot be evaluated or saved.
         """
-        report = evaluate(model, self.parts[2])
+        report = evaluate(model, self.test)
         if self._out is not None:
             records = self._records.get("", self._records)
             training = {
                 **records,
                 "fractions": _FRACTIONS,
-                "cycles": [len(part) for part in self.parts],
+                "cycles": self.cycles,
             }
             save_model(
                 self._out,
