@@ -336,7 +336,9 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(worker):
 
 def test_a_protocol_is_part_of_what_a_data_set_is(copy):
     refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="corridor"), "protocol")
-    refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="other"), "paper, corridor, slow")
+    refused(
+        lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="other"), "paper, corridor, slow"
+    )
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30, 31, 47, 449, 451, 1801, 10_718, 10_800])

@@ -113,7 +113,17 @@ class HeightChange(nnx.Module):
 
         `rngs` switches dropout on.
         """
-        rows = jnp.concatenate([self.before.weights(maps), known], axis=-1)
+        return self.of_components(self.before.weights(maps), known, rngs=rngs)
+
+    def of_components(
+        self,
+        before: Float[Array, "*batch m"],
+        known: Float[Array, "*batch 5"],
+        *,
+        rngs: nnx.Rngs | None = None,
+    ) -> Float[Array, "*batch k"]:
+        """The same from the weights of the components of the map, see `Patterns.weights`."""
+        rows = jnp.concatenate([before, known], axis=-1)
         return self.weights(self.scale.standardise(rows), rngs=rngs)
 
 

@@ -31,6 +31,8 @@ _WARM_UP = 0.05
 _LARGEST_GRADIENT = 1.0
 # Examples of the validation part at a time, which bounds the memory.
 _CHUNK = 256
+# Rows from which scales and components are taken, at least, where there are as many.
+_ENOUGH = 20_000
 # Least time between two saved states [s].
 _SAVE_EVERY = 30.0
 
@@ -151,6 +153,15 @@ def of_errors(errors: Float[Array, "*n"], loss: str) -> Float[Array, "*n"]:
     if loss == "squared":
         return errors**2
     return jnp.sqrt(errors**2 + _HUBER**2) - _HUBER
+
+
+def evenly(table: Mapping[str, Any]) -> dict[str, Array]:
+    """Rows of a table, evenly spread over it, that are enough to take scales and components from.
+
+    Up to 40,000 rows these are all of them.
+    """
+    stride = max(len(next(iter(table.values()))) // _ENOUGH, 1)
+    return {name: jnp.asarray(values[::stride]) for name, values in table.items()}
 
 
 def mirror_some(key: Array, maps: Float[Array, "n i j"]) -> tuple[Array, Bool[Array, " n"]]:

@@ -19,7 +19,7 @@ from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance import PerformanceModel, PsiLow
 from wlplan.models.performance_high import HighPerformanceModel, PsiHigh
 from wlplan.training.evaluation import EvaluationReport, evaluate_performance, widening
-from wlplan.training.fitting import Recipe, mirror_some, of_errors
+from wlplan.training.fitting import Recipe, evenly, mirror_some, of_errors
 from wlplan.training.session import Session
 from wlplan.types import PyTree
 
@@ -159,7 +159,7 @@ def train_psi_high(
             scattered=members > 1,
             rngs=nnx.Rngs(seed),
         )
-        network.fit_scales(**examples[0])
+        network.fit_scales(**evenly(examples[0]))
         return network
 
     def mean_loss(network: PsiHigh, e: PyTree, rngs: nnx.Rngs | None) -> Array:

@@ -18,7 +18,7 @@ from wlplan.errors import InputError
 from wlplan.heightmap import STATE_DISPLACEMENT
 from wlplan.models.height_change import HeightChange, HeightChangeModel
 from wlplan.models.pile_state import Phi, PileStateModel, scaled
-from wlplan.training.fitting import Recipe, mirror_some
+from wlplan.training.fitting import Recipe, evenly, mirror_some
 from wlplan.training.session import Session
 from wlplan.types import LocalHeightmap, PyTree
 from wlplan.units import CELL_SIZE, KG_PER_TONNE
@@ -28,8 +28,8 @@ _DENSITY = 1727.0
 # Weight of the divergence beside the squared error. Paper, section 6.4.2. We read both as sums,
 # over cells and over the code: with the mean over 2,704 cells the code would tell nothing.
 _DIVERGENCE = 0.1
-# Cycles predicted at a time, which bounds the memory.
-_CHUNK = 64
+# Cycles predicted at a time, and whose components are taken at a time: they bound the memory.
+_CHUNK, _PORTION = 64, 4096
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,31 +138,23 @@ def train_phi(
     recipe = Recipe(epochs, batch, learning_rate, seed=seed)
     session = Session(dataset, out, recipe, _tables)
     network = HeightChange(hidden, activation=activation, dropout=dropout, rngs=nnx.Rngs(seed))
-    maps, changes, known = (
-        [jnp.asarray(table[name]) for table in session.tables[:2]]
-        for name in ("maps", "changes", "known")
-    )
-    network.fit_scales(maps[0], changes[0], known[0])
-    examples = [
-        {
-            "maps": h,
-            "known": k,
-            "weights": network.change.weights(c),
-            "mirrored": network.change.weights(c[:, :, ::-1]),
-        }
-        for h, c, k in zip(maps, changes, known, strict=True)
-    ]
+    network.fit_scales(**evenly(session.tables[0]))
+    # The components are not trained: what they make of the maps is the same in every epoch.
+    examples = [_components(network, table) for table in session.tables[:2]]
     # In units of the first component, which brings the loss to the order of one.
-    spread = float(examples[0]["weights"].std(axis=0).max()) or 1.0
+    spread = float(examples[0]["change"].std(axis=0).max()) or 1.0
 
     def loss(network: Any, e: PyTree, rngs: nnx.Rngs | None) -> Array:
-        error = network(e["maps"], e["known"], rngs=rngs) - e["weights"]
+        error = network.of_components(e["before"], e["known"], rngs=rngs) - e["change"]
         return jnp.mean(jnp.sum((error / spread) ** 2, axis=-1))
 
     def mirror(key: Array, e: PyTree) -> PyTree:
-        maps, mirrored = mirror_some(key, e["maps"])
-        weights = jnp.where(mirrored[:, None], e["mirrored"], e["weights"])
-        return {**e, "maps": maps, "weights": weights}
+        mirrored = jax.random.bernoulli(key, 0.5, (len(e["known"]), 1))
+        return {
+            "before": jnp.where(mirrored, e["before mirrored"], e["before"]),
+            "change": jnp.where(mirrored, e["change mirrored"], e["change"]),
+            "known": e["known"],
+        }
 
     best = session.fit(network, loss, examples, augment=mirror, progress=progress)
     model = HeightChangeModel(best, nnx.graphdef(network))
@@ -240,6 +232,28 @@ def train_phi_vae(
     graph, params = nnx.split(phi)
     model = PileStateModel(params, graph)
     return model, session.finish(model, evaluate_pile_state)
+
+
+def _components(
+    network: HeightChange, table: Mapping[str, np.ndarray]
+) -> dict[str, Float[Array, "n k"]]:
+    """Weights of the components of maps and changes, and of their mirror images."""
+
+    @jax.jit
+    def weights(maps: Array, changes: Array) -> dict[str, Array]:
+        return {
+            "before": network.before.weights(maps),
+            "before mirrored": network.before.weights(maps[:, :, ::-1]),
+            "change": network.change.weights(changes),
+            "change mirrored": network.change.weights(changes[:, :, ::-1]),
+        }
+
+    starts = range(0, len(table["known"]), _PORTION)
+    portions = [
+        weights(table["maps"][s : s + _PORTION], table["changes"][s : s + _PORTION]) for s in starts
+    ]
+    rows = {name: jnp.concatenate([p[name] for p in portions]) for name in portions[0]}
+    return rows | {"known": jnp.asarray(table["known"])}
 
 
 def _tables(dataset: Dataset) -> dict[str, np.ndarray]:

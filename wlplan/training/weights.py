@@ -23,9 +23,9 @@ class _Part(NamedTuple):
     cycles: int
 
 
-# The first is as large as the paper's; figures that stand beside the paper's are of it and of models
-# trained on it alone. With all of them ψ_high errs by half as much. Each has a seed of its own: with
-# the same, piles and first loadings would be the same too.
+# The first is as large as the paper's; figures that stand beside the paper's are of it and of
+# models trained on it alone. With all of them ψ_high errs by half as much. Each has a seed of its
+# own: with the same, piles and first loadings would be the same too.
 _DATA = (
     _Part("", "paper", 10_800),
     _Part("-corridor", "corridor", 10_800),
@@ -85,8 +85,13 @@ def train_all(
         place = data.with_name(f"{data.stem}{part.suffix}{data.suffix}")
         tell = told(f"cycles, {place.name}")
         if is_new(place):
-            wanted = {"cycles": part.cycles, "seed": seed + number, "protocol": part.protocol}
-            collect(place, **wanted, progress=tell)
+            collect(
+                place,
+                cycles=part.cycles,
+                seed=seed + number,
+                protocol=part.protocol,
+                progress=tell,
+            )
         elif (begun := read_attributes(place)).get("cycles_done") != begun.get("cycles"):
             same = {name: begun[name] for name in ("cycles", "seed", "protocol")}
             collect(place, **same, progress=tell)
