@@ -22,6 +22,7 @@ from wlplan.training import (
     load_model,
     read_description,
     save_model,
+    shares_piles,
     storage,
     train_psi_low,
 )
@@ -204,6 +205,20 @@ def test_only_the_test_part_of_the_training_data_is_held_out(saved, data):
     assert evaluate_performance(saved[1], part).as_dict() == description["held_out"]
     other = synthetic(seed=1)
     assert held_out(other, description) is other
+
+
+def test_a_data_set_that_begins_with_the_same_piles_is_noticed(data, tmp_path):
+    def of_seed(seed):
+        return dataclasses.replace(data, attributes={**data.attributes, "seed": seed})
+
+    train_psi_low(of_seed(3), out=tmp_path / "model", **(LIGHT | {"epochs": 1}))
+    description = read_description(tmp_path / "model")
+    assert description["dataset"]["seeds"] == [3]
+    assert not shares_piles(of_seed(3), description)  # has a test part of its own
+    part = of_seed(3).select(data.rollout < 3)
+    assert shares_piles(part, description)
+    other = dataclasses.replace(part, attributes={**data.attributes, "seed": 4})
+    assert not shares_piles(other, description)
 
 
 # --- models on disk

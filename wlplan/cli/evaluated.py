@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from wlplan.cli.outputs import print_table, titled_table
+from wlplan.cli.outputs import QUANTITIES, print_table, titled_table
 from wlplan.published import PERFORMANCE, PILE_STATE
 
 
@@ -63,4 +63,55 @@ def print_times(times: Sequence[Mapping[str, Any]], paper: float) -> None:
             f"{record['compile_s']:.1f} s",
         )
     table.add_row("paper, one input", f"{1e3 * paper:.2f} ms", "", "", "")
+    print_table(table)
+
+
+def print_pile_state(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
+    """Errors of a pile state predictor, beside the paper's on the paper's data."""
+    table = titled_table(title)
+    for column in ("", "cycles", "misplaced volume", "relative to the pile", "volume removed"):
+        table.add_column(column, justify="left" if not column else "right")
+    for name, errors in rows:
+        table.add_row(
+            name,
+            str(errors["cycles"]),
+            f"{errors['mean_absolute']:.3f} m³",
+            f"{100.0 * errors['mean_relative']:.2f} %",
+            f"{100.0 * errors['total_volume']:+.2f} %",
+        )
+    for blend, name in ((True, "paper, edges blended"), (False, "paper, as predicted")):
+        result = PILE_STATE[blend]
+        relative = f"{100.0 * result.mean_relative:.2f} %"
+        table.add_row(name, "", f"{result.mean_absolute:.2f} m³", relative, "")
+    print_table(table)
+
+
+def print_errors(
+    title: str, report: Mapping[str, Any], paper: Mapping[str, float] | None = None
+) -> None:
+    """Errors of a performance predictor, and the paper's on the paper's data."""
+    table = titled_table(title)
+    for column in ("", "cycles", "mass", "time", "work"):
+        table.add_column(column, justify="left" if not column else "right")
+    kinds = (
+        ("mean_relative", "mean relative error", lambda v, unit: f"{100.0 * v:.2f} %"),
+        ("mean_absolute", "mean absolute error", lambda v, unit: f"{v:.3g} {unit}"),
+        ("total_relative", "error of the sum", lambda v, unit: f"{100.0 * v:+.2f} %"),
+    )
+    loaded = f"loads over {report['loaded_mass']:g} t"
+    for name, which in (("loaded", loaded), ("every", "all valid cycles")):
+        part = report[name]
+        for key, label, write in kinds:
+            cells = (write(part[key][q], unit) for q, (_, unit, _) in QUANTITIES.items())
+            table.add_row(f"{label}, {which}", str(part["cycles"]), *cells)
+    if "intervals" in report:
+        inside = (report["intervals"][q]["coverage"] for q in QUANTITIES)
+        table.add_row(
+            "inside the interval of 90 %, all valid cycles",
+            str(report["every"]["cycles"]),
+            *(f"{100.0 * part:.1f} %" for part in inside),
+        )
+    if paper is not None:
+        cells = (f"{100.0 * paper[q]:.2f} %" for q in QUANTITIES)
+        table.add_row("paper: mean relative error, all cycles", "1072", *cells)
     print_table(table)

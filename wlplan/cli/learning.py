@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 from click.core import ParameterSource
 
+from wlplan.cli.evaluated import evaluated, print_errors, print_pile_state, print_times
 from wlplan.cli.inputs import check_is_folder, site_named
 from wlplan.cli.options import (
     ACTIVATIONS,
@@ -21,10 +22,9 @@ from wlplan.cli.options import (
     site_options,
     with_options,
 )
-from wlplan.cli.outputs import QUANTITIES, checked_folder, json_text, print_table, titled_table
+from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.progress import Progress, Stopwatch
 from wlplan.errors import InputError
-from wlplan.published import PILE_STATE
 
 # A data set of so many takes 32 GB.
 _MOST_CYCLES = 1_000_000
@@ -262,7 +262,7 @@ def train(
     if kind == "all":
         checked_folder(out)
         if len(data) > 1:
-            raise InputError("--data names one place for all: the other data set lies beside it.")
+            raise InputError("--data names one place for all: the other data sets lie beside it.")
         _train_all(data[0], out, epochs=epochs, seed=seed, as_json=as_json)
         return
     for each in data:
@@ -287,9 +287,9 @@ def train(
         return
     title = f"{kind}, held-out part of {', '.join(data)}"
     if kind.startswith("phi"):
-        _print_pile_state(title, [("ours", report.as_dict())])
+        print_pile_state(title, [("ours", report.as_dict())])
     else:
-        _print_errors(title, report.as_dict())
+        print_errors(title, report.as_dict())
     print(f"training {training.text()}")
     print(f"written: {out}")
 
@@ -309,11 +309,11 @@ def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: b
         click.echo(json_text({"model": "all", "out": out, "held_out": reports}))
         return
     for kind, report in reports.items():
-        title = f"{kind.replace('_', '-')}, held-out part of {data}"
+        title = f"{kind.replace('_', '-')}, held-out parts of {data} and those beside it"
         if kind == "phi":
-            _print_pile_state(title, [("ours", report)])
+            print_pile_state(title, [("ours", report)])
         else:
-            _print_errors(title, report)
+            print_errors(title, report)
     print(f"training {training.text()}")
     print(f"written: {', '.join(str(Path(out) / kind) for kind in reports)}")
 
@@ -336,9 +336,8 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     if model is not None:
         check_is_folder(model, "model", "wlplan train")
 
-    from wlplan.cli.evaluated import evaluated, print_times
     from wlplan.dataset import open_dataset
-    from wlplan.training import held_out, load_model, read_description
+    from wlplan.training import held_out, load_model, read_description, shares_piles
     from wlplan.worlds import pretrained_path
 
     folder = pretrained_path("psi_low") if model is None else Path(model)
@@ -346,6 +345,12 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     predictor: Any = load_model(folder, description["kind"])
     dataset = open_dataset(data)
     part = held_out(dataset, description)
+    if shares_piles(dataset, description):
+        seed_of = dataset.attributes["seed"]
+        remark(
+            f"{data} has seed {seed_of}, as a data set that the model was trained on: it has seen "
+            f"some of these piles, and errs less on them. Collect with another seed."
+        )
     found = evaluated(predictor, part, description)
     kind = description["kind"].replace("_", "-")
     if as_json:
@@ -357,58 +362,7 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
         without = found["errors"].get("without_blending")
         ways = {"edges blended": found["errors"], "as predicted": without}
         rows = {"ours": found["errors"]} if without is None else ways
-        _print_pile_state(title, list(rows.items()))
+        print_pile_state(title, list(rows.items()))
     else:
-        _print_errors(title, found["errors"], found["paper"]["mean_relative"])
+        print_errors(title, found["errors"], found["paper"]["mean_relative"])
     print_times(found["inference"], found["paper"]["inference_s"])
-
-
-def _print_pile_state(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> None:
-    """Errors of a pile state predictor, beside the paper's on the paper's data."""
-    table = titled_table(title)
-    for column in ("", "cycles", "misplaced volume", "relative to the pile", "volume removed"):
-        table.add_column(column, justify="left" if not column else "right")
-    for name, errors in rows:
-        table.add_row(
-            name,
-            str(errors["cycles"]),
-            f"{errors['mean_absolute']:.3f} m³",
-            f"{100.0 * errors['mean_relative']:.2f} %",
-            f"{100.0 * errors['total_volume']:+.2f} %",
-        )
-    for blend, name in ((True, "paper, edges blended"), (False, "paper, as predicted")):
-        result = PILE_STATE[blend]
-        relative = f"{100.0 * result.mean_relative:.2f} %"
-        table.add_row(name, "", f"{result.mean_absolute:.2f} m³", relative, "")
-    print_table(table)
-
-
-def _print_errors(
-    title: str, report: Mapping[str, Any], paper: Mapping[str, float] | None = None
-) -> None:
-    """Errors of a performance predictor, and the paper's on the paper's data."""
-    table = titled_table(title)
-    for column in ("", "cycles", "mass", "time", "work"):
-        table.add_column(column, justify="left" if not column else "right")
-    kinds = (
-        ("mean_relative", "mean relative error", lambda v, unit: f"{100.0 * v:.2f} %"),
-        ("mean_absolute", "mean absolute error", lambda v, unit: f"{v:.3g} {unit}"),
-        ("total_relative", "error of the sum", lambda v, unit: f"{100.0 * v:+.2f} %"),
-    )
-    loaded = f"loads over {report['loaded_mass']:g} t"
-    for name, which in (("loaded", loaded), ("every", "all valid cycles")):
-        part = report[name]
-        for key, label, write in kinds:
-            cells = (write(part[key][q], unit) for q, (_, unit, _) in QUANTITIES.items())
-            table.add_row(f"{label}, {which}", str(part["cycles"]), *cells)
-    if "intervals" in report:
-        inside = (report["intervals"][q]["coverage"] for q in QUANTITIES)
-        table.add_row(
-            "inside the interval of 90 %, all valid cycles",
-            str(report["every"]["cycles"]),
-            *(f"{100.0 * part:.1f} %" for part in inside),
-        )
-    if paper is not None:
-        cells = (f"{100.0 * paper[q]:.2f} %" for q in QUANTITIES)
-        table.add_row("paper: mean relative error, all cycles", "1072", *cells)
-    print_table(table)

@@ -7,7 +7,7 @@ was cut short goes on where it stopped and ends with the same weights.
 
 from wlplan.training.evaluation import Errors, EvaluationReport, evaluate_performance
 from wlplan.training.fitting import LOSSES
-from wlplan.training.performance import held_out, train_psi_high, train_psi_low
+from wlplan.training.performance import held_out, shares_piles, train_psi_high, train_psi_low
 from wlplan.training.pile_state import (
     PileStateErrors,
     evaluate_pile_state,
@@ -29,6 +29,7 @@ __all__ = [
     "load_model",
     "read_description",
     "save_model",
+    "shares_piles",
     "train_all",
     "train_phi",
     "train_phi_vae",

@@ -193,6 +193,20 @@ def held_out(dataset: Dataset, description: Mapping[str, Any]) -> Dataset:
     return split(dataset, fractions=tuple(description["training"]["fractions"]))[2]
 
 
+def shares_piles(dataset: Dataset, description: Mapping[str, Any]) -> bool:
+    """Whether a model that was not trained on a data set still knows piles of it.
+
+    Data sets of one seed begin with the same piles and actions, whatever their protocol and size.
+
+    Args:
+        dataset: Any data set.
+        description: Description of the model, see `read_description`.
+    """
+    known = description.get("dataset", {})
+    trained_on = fingerprint(dataset) in known.get("fingerprints", ())
+    return not trained_on and dataset.attributes.get("seed") in known.get("seeds", ())
+
+
 def _tables(dataset: Dataset) -> dict[str, np.ndarray]:
     return {
         "inputs": np.concatenate([dataset.characteristics, dataset.action], axis=1),

@@ -91,6 +91,7 @@ class Session:
             # Of the first; the others are of the same soil and machine.
             **datasets[0].attributes,
             "protocols": [each.attributes.get("protocol") for each in datasets],
+            "seeds": [each.attributes.get("seed") for each in datasets],
             "probes": probes_of(datasets[0]),
         }
         self._records: dict[str, dict[str, Any]] = {}
