@@ -45,7 +45,7 @@ _TRAININGS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         train_psi_high,
         {"members": 5, "hidden": (256,) * 3, "dropout": 0.0, "epochs": 60, "batch": 256},
     ),
-    "phi": (train_phi, {"dropout": 0.0, "epochs": 40, "batch": 256}),
+    "phi": (train_phi, {"hidden": (512,) * 3, "dropout": 0.0, "epochs": 40, "batch": 256}),
 }
 
 
