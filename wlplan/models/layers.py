@@ -30,8 +30,8 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 _MARGIN = 0.25
 
 # Variance of an error that a network begins with, over that of the data, and the largest exponent
-# by which it can differ from it: a factor of 150 in the standard deviation up and down.
-_USUAL_VARIANCE, _LARGEST_EXPONENT = 0.135, 5.0
+# by which it can differ from it: standard deviations from 0.004 to 5 of that of the data.
+_USUAL_VARIANCE, _LARGEST_EXPONENT = 0.02, 7.0
 
 
 class Standardiser(nnx.Module):
