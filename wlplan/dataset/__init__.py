@@ -4,7 +4,8 @@ The protocol is the paper's (section 6.2). A rollout takes one of the six seed p
 its own, and digs it 30 times in a row; each loading starts at a random accessible point of the toe
 of the pile as it then is, heads into it to within 10 degrees of the normal, and takes its action
 from a Latin hypercube. A set is one rollout of each seed pile; its 180 actions are one hypercube.
-The protocol "corridor" digs on where it dug before, as plans do; all else is the same.
+The protocol "corridor" digs on where it dug before, as plans do; "slow" takes actions like the last
+one by which the filling was slow. All else is the same.
 
 Everything random about a rollout follows from the seed and the number of the rollout alone, so a
 collection that was cut short goes on where it stopped and ends with the same bytes. For the same
