@@ -30,7 +30,7 @@ from wlplan.units import ACTION_HIGH
 from wlplan.worlds import HybridWorld, LowWorld
 
 MEMBERS = 5
-LIGHT = {"epochs": 30, "batch": 64, "hidden": (128,), "learning_rate": 1e-2, "members": MEMBERS}
+LIGHT = {"epochs": 30, "batch": 160, "hidden": (128,), "learning_rate": 1e-2, "members": MEMBERS}
 ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
 
 
@@ -39,7 +39,7 @@ def scatter(slope):
     return 0.02 + 0.5 * (slope - 0.2)
 
 
-def cycles(rollouts=80, loads=20, seed=0):
+def cycles(rollouts=200, loads=20, seed=0):
     """Cycles whose mass scatters the more, the steeper the pile."""
     n = rollouts * loads
     random = np.random.default_rng(seed)
