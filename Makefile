@@ -46,7 +46,7 @@ $(VENV)/.engine: $(VENV)/.tools
 	@touch $@
 
 demo: $(VENV)/.package
-	$(BIN)/wlplan plan --loads $(LOADS) --out demo
+	$(BIN)/wlplan plan --loads $(LOADS) --world hybrid --out demo
 	@echo "pictures: demo/plan.png and demo/totals.png; both and all numbers: demo/report.html"
 
 test: $(VENV)/.tools
