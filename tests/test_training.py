@@ -219,6 +219,7 @@ def test_a_data_set_that_begins_with_the_same_piles_is_noticed(data, tmp_path):
     assert shares_piles(part, description)
     other = dataclasses.replace(part, attributes={**data.attributes, "seed": 4})
     assert not shares_piles(other, description)
+    assert not shares_piles(dataclasses.replace(part, attributes={}), description)
 
 
 # --- models on disk

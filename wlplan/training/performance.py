@@ -203,8 +203,9 @@ def shares_piles(dataset: Dataset, description: Mapping[str, Any]) -> bool:
         description: Description of the model, see `read_description`.
     """
     known = description.get("dataset", {})
+    seed = dataset.attributes.get("seed")
     trained_on = fingerprint(dataset) in known.get("fingerprints", ())
-    return not trained_on and dataset.attributes.get("seed") in known.get("seeds", ())
+    return seed is not None and seed in known.get("seeds", ()) and not trained_on
 
 
 def _tables(dataset: Dataset) -> dict[str, np.ndarray]:
