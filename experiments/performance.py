@@ -21,7 +21,7 @@ from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.published import PERFORMANCE
 from wlplan.training import evaluate_performance
 
-# Trainings of each model; of the paper's ψ_high, which takes ten minutes, one.
+# Trainings of each model; of the paper's ψ_high, which takes five minutes, one.
 SEEDS, SEEDS_OF_THE_PAPERS = 5, 1
 NAMES = ("mass", "time", "work")
 
@@ -91,10 +91,12 @@ def draw(folder: Path) -> None:
                 at = 100.0 * result["paper"][name][quantity]
                 panel.plot([at], [-row], "|", ms=14, color=FAINT)
         panel.set_xlim(left=0.0)
-        panel.set_title(f"{quantity}, mean relative error [%]", fontsize=8)
-        panel.set_yticks([-row for row in range(len(names))], names, fontsize=8)
+        panel.set_title(quantity, fontsize=8)
+        labels = [name.replace("psi", "ψ") for name in names]
+        panel.set_yticks([-row for row in range(len(names))], labels, fontsize=8)
         tidy(panel)
-    figure.supxlabel("dots: trainings; bar: the paper's, on its own data", fontsize=8)
+    text = "mean relative error [%]; dots: trainings here; bar: the paper's, on its own data"
+    figure.supxlabel(text, fontsize=8)
     write_bytes_atomic(folder / "performance.png", png_bytes(figure))
 
 
