@@ -92,7 +92,7 @@ def _part(pool: Dataset, size: int, seed: int) -> tuple[Dataset, dict[str, Any]]
 def draw(folder: Path) -> None:
     """Mean relative error over the number of cycles; each training a dot."""
     result = json.loads((folder / "learning_curve.json").read_text())
-    figure = new_figure(8.4, 2.9)
+    figure = new_figure(8.4, 3.3)
     for k, (panel, quantity) in enumerate(zip(figure.subplots(1, 3), NAMES, strict=True)):
         for kind, colour in zip(MODELS, (BLUE, ORANGE), strict=True):
             rows = result["models"][kind]
@@ -119,8 +119,8 @@ def draw(folder: Path) -> None:
         panel.set_title(f"{quantity}, mean relative error [%]", fontsize=8)
         panel.set_xlabel("cycles for training and validation", fontsize=8, color=FAINT)
         tidy(panel)
-        if k == 0:
-            panel.legend(fontsize=7, frameon=False)
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=7, frameon=False)
     write_bytes_atomic(folder / "learning_curve.png", png_bytes(figure))
 
 
