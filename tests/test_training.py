@@ -262,7 +262,7 @@ def test_few_cycles_that_are_far_off_do_not_spoil_the_rest(data):
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_small_errors_count_by_their_square(loss):
-    errors = jnp.array([1e-2, -2e-2])
+    errors = 0.05 * fitting._HUBER * jnp.array([1.0, -2.0])
     small, double = fitting.of_errors(errors, loss)
     assert float(double / small) == pytest.approx(4.0, rel=0.02)
     large, double = fitting.of_errors(jnp.array([10.0, -20.0]), loss)
