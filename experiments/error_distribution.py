@@ -2,7 +2,8 @@
 
 Paper, figures 9 and 10: relative errors on held-out cycles, scattered over the simulated outcome,
 with moving averages and the distribution of the data; and the ten loads that ψ_low predicts worst,
-with the pile they were dug from.
+with the pile they were dug from. Beside it, also of the models that ship, how the errors are
+spread, and what part of them comes from loadings that stall.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.record import described, main
-from experiments.trained import PSI, SHORT, trained
+from experiments.trained import PSI, SHIPPED, SHORT, shipped, trained
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
 from wlplan.machine import WA320
@@ -27,6 +28,8 @@ from wlplan.units import CELL_SIZE
 MODELS = ("psi_low, swish", "psi_high, swish")
 OUTCOMES = {"mass": "t", "time": "s", "work": "kJ"}
 WORST = 10
+# A loading that takes longer counts as stalled [s]: most take 7 to 10, one that gets nowhere 21.
+STALL = 15.0
 # Part of the cycles in a window of the moving average.
 WINDOW = 0.05
 # Decrease and increase of the surface in the maps of the worst predictions [m].
@@ -39,14 +42,19 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     smoke = preset == "smoke"
     test = split(data)[2]
     test = test.select(test.valid & (test.mass > 0.0))
-    errors = {}
-    for title in MODELS:
-        model, _ = trained(models, data, **(PSI[title] | (SHORT if smoke else {})))
+    compared: dict[str, Any] = {
+        title: trained(models, data, **(PSI[title] | (SHORT if smoke else {})))[0]
+        for title in MODELS
+    }
+    compared |= {title: shipped(kind)[0] for title, kind in SHIPPED.items()}
+    errors, stalls = {}, {}
+    for title, model in compared.items():
         predicted = predict(model, test)
         errors[title] = {
             name: np.asarray(getattr(predicted, name)) / getattr(test, name) - 1.0
             for name in OUTCOMES
         }
+        stalls[title] = _by_stall(test.time, np.asarray(predicted.time), errors[title])
     worst = np.argsort(-np.abs(errors[MODELS[0]]["mass"]))[:WORST]
     return {
         "data": described(data),
@@ -55,15 +63,20 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
             name: [float(f"{value:.4g}") for value in getattr(test, name)] for name in OUTCOMES
         },
         "error": {
-            title: {name: values.astype(float).round(3).tolist() for name, values in table.items()}
-            for title, table in errors.items()
+            title: {
+                name: values.astype(float).round(3).tolist()
+                for name, values in errors[title].items()
+            }
+            for title in MODELS
         },
         "shares": {
             title: {name: _shares(values) for name, values in table.items()}
             for title, table in errors.items()
         },
+        "by_stall": stalls,
         "worst": [
-            _worst(test, int(n), {t: e["mass"][n] for t, e in errors.items()}) for n in worst
+            _worst(test, int(n), {title: errors[title]["mass"][n] for title in MODELS})
+            for n in worst
         ],
         "skew": _skew(test, worst),
     }
@@ -74,6 +87,35 @@ def _shares(errors: Float[np.ndarray, " n"]) -> dict[str, float]:
     sizes = np.abs(errors)
     half, most, nearly = (float(v) for v in np.percentile(sizes, [50.0, 90.0, 99.0]))
     return {"mean": float(sizes.mean()), "median": half, "p90": most, "p99": nearly}
+
+
+def _by_stall(
+    time: Float[np.ndarray, " n"], predicted: Float[np.ndarray, " n"], errors: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """Errors of the cycles that stall, or that the model takes for such, and of the rest.
+
+    Args:
+        time: Simulated time [s].
+        predicted: Predicted time [s].
+        errors: Relative errors of each quantity.
+    """
+    stalled, foreseen = time > STALL, predicted > STALL
+    groups = {
+        "missed": stalled & ~foreseen,
+        "foreseen in vain": ~stalled & foreseen,
+        "foreseen": stalled & foreseen,
+        "no stall": ~(stalled | foreseen),
+    }
+    return {
+        group: {"cycles": int(which.sum())}
+        | {
+            # Together the parts are the mean error of all cycles.
+            name: _shares(values[which]) | {"part": float((np.abs(values) * which).mean())}
+            for name, values in errors.items()
+            if which.any()
+        }
+        for group, which in groups.items()
+    }
 
 
 def _worst(data: Dataset, n: int, errors: dict[str, Any]) -> dict[str, Any]:

@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 
 from experiments.record import described, main
-from experiments.trained import SHORT, trained
+from experiments.trained import SHORT, shipped, trained
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
 from wlplan.plots import png_bytes
 from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.published import PERFORMANCE
-from wlplan.training import evaluate_performance, load_model, read_description
-from wlplan.worlds import pretrained_path
+from wlplan.training import evaluate_performance
 
 SIZES, SEEDS = (100, 300, 1000, 3000), 3
 MODELS = {"psi_low": "ψ_low", "psi_high": "ψ_high (ours)"}
@@ -75,10 +74,12 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
 
 def _shipped(kind: str, test: Dataset) -> dict[str, Any]:
     """Cycles and errors of a model that ships."""
-    place = pretrained_path(kind)
-    known = read_description(place, kind)["training"]["cycles"][:2]
-    report = evaluate_performance(load_model(place, kind), test)
-    return {"cycles": sum(known), "mean": report.every.mean_relative}
+    model, description = shipped(kind)
+    report = evaluate_performance(model, test)
+    return {
+        "cycles": sum(description["training"]["cycles"][:2]),
+        "mean": report.every.mean_relative,
+    }
 
 
 def _part(pool: Dataset, size: int, seed: int) -> tuple[Dataset, dict[str, Any]]:

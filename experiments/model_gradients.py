@@ -34,7 +34,7 @@ from experiments.simulator_gradients import (
     replayed,
     site_of_the_line,
 )
-from experiments.trained import PSI, SHORT, trained
+from experiments.trained import PSI, SHIPPED, SHORT, shipped, trained
 from wlplan.characteristics import as_vector, characteristics
 from wlplan.dataset import Dataset
 from wlplan.heightmap import sample_local
@@ -44,10 +44,9 @@ from wlplan.models.performance import PerformanceModel
 from wlplan.models.performance_high import HighPerformanceModel
 from wlplan.plots import png_bytes
 from wlplan.plots.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
-from wlplan.training import load_model
+from wlplan.training.evaluation import sees_map
 from wlplan.types import Pile, Pose
 from wlplan.units import CELL_SIZE
-from wlplan.worlds import pretrained_path
 
 # Parts of a gradient: the poses of the data set lie on the toe, so what the way ahead does has
 # never been seen; a planner moves along the toe and turns.
@@ -63,8 +62,6 @@ PARTS = {
 # 0.5 m, 3 degrees and 5 %, about as far as a planner moves.
 STEPS = {"1e-6": 1e-6, "0.01": 1e-2, "0.1": 1e-1, "0.5": 0.5}
 MODELS = tuple(title for title in PSI if "of the paper" not in title)
-# The ensembles that ship, trained on more cycles and with Swish.
-SHIPPED = {f"{kind}, as it ships": kind for kind in ("psi_low", "psi_high")}
 COLOURS = {"swish": BLUE, "leaky relu": ORANGE, "as it ships": "#3a7d44"}
 
 
@@ -75,7 +72,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
         title: trained(models, data, **(PSI[title] | (SHORT if smoke else {})))[0]
         for title in MODELS
     }
-    chosen |= {title: load_model(pretrained_path(kind), kind) for title, kind in SHIPPED.items()}
+    chosen |= {title: shipped(kind)[0] for title, kind in SHIPPED.items()}
     with jax.enable_x64(True):
         cases = random_cases(1 if smoke else ROLLOUTS, 2 if smoke else LOADS)
         differences = _differences(cases)
@@ -108,10 +105,8 @@ def _outcome(
 ) -> Float[Array, "3"]:
     """Mass, time and work that a model predicts for a pose and an action."""
     local = sample_local(Pile(height, CELL_SIZE, origin), Pose(*vector[:3]))
-    if isinstance(getattr(model, "members", model), PerformanceModel):
-        predicted = model(as_vector(characteristics(local)), vector[3:])
-    else:
-        predicted = model(local, vector[3:])
+    view = local if sees_map(model) else as_vector(characteristics(local))
+    predicted = model(view, vector[3:])
     return jnp.stack([predicted.mass, predicted.time, predicted.work])
 
 

@@ -32,7 +32,7 @@ from scipy.spatial import cKDTree
 
 from experiments.record import described, main
 from experiments.replays import in_batches, surfaces
-from experiments.trained import PSI, SHORT, trained
+from experiments.trained import PSI, SHIPPED, SHORT, shipped, trained
 from wlplan.dataset import LOADS, Dataset, split
 from wlplan.heightmap import PERFORMANCE_CELLS, STATE_CELLS, STATE_DISPLACEMENT
 from wlplan.io import write_bytes_atomic
@@ -40,17 +40,14 @@ from wlplan.models.performance import PerformanceModel
 from wlplan.plots import png_bytes
 from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.simulator import dig
-from wlplan.training import load_model
 from wlplan.training.evaluation import predict
 from wlplan.types import Action
 from wlplan.units import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
-from wlplan.worlds import pretrained_path
 
 SEED = 11
 CYCLES, REPEATS = 250, 12
 NAMES = ("mass", "time", "work")
 MODELS = ("psi_low, swish", "psi_high, swish")
-SHIPPED = ("psi_low", "psi_high")
 SHAPE = (STATE_CELLS, STATE_CELLS)
 # More neighbours than these are not looked at in vain: some cycles are not valid.
 INVALID = 30
@@ -74,10 +71,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
         title: trained(models, data, **(PSI[title] | (SHORT if smoke else {})))[0]
         for title in MODELS
     }
-    # They know more cycles, but not the held-out ones of this data set.
-    predictors |= {
-        f"{kind} that ships": load_model(pretrained_path(kind), kind) for kind in SHIPPED
-    }
+    predictors |= {title: shipped(kind)[0] for title, kind in SHIPPED.items()}
     truth = np.stack([getattr(chosen, name) for name in NAMES], axis=1).astype(np.float64)
     others = _alike(chosen, data, repeats)
     variants = {kind: change(surfaces(chosen), repeats, random) for kind, change in CHANGES.items()}

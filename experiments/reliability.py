@@ -16,14 +16,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scipy.stats import norm
 
 from experiments.record import described, main
+from experiments.trained import shipped
 from wlplan.dataset import Dataset
 from wlplan.io import write_bytes_atomic
-from wlplan.models.ensemble import Ensemble
 from wlplan.plots import png_bytes
 from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
-from wlplan.training import held_out, load_model, read_description
+from wlplan.training import held_out
 from wlplan.training.evaluation import predict_with_deviation
-from wlplan.worlds import pretrained_path
 
 MODELS = ("psi_low", "psi_high")
 OUTCOMES = {"mass": "t", "time": "s", "work": "kJ"}
@@ -36,10 +35,8 @@ def run(preset: str, data: Dataset) -> dict[str, Any]:
     del preset  # nothing is trained: it takes seconds
     rows: dict[str, Any] = {}
     for kind in MODELS:
-        place = pretrained_path(kind)
-        ensemble: Any = load_model(place, kind)
-        assert isinstance(ensemble, Ensemble)
-        part = held_out(data, read_description(place, kind))
+        ensemble, description = shipped(kind)
+        part = held_out(data, description)
         part = part.select(part.valid)
         predicted, deviation = predict_with_deviation(ensemble, part)
         rows[kind] = {"cycles": len(part), "members": ensemble.size}

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from experiments.error_distribution import STALL
 from experiments.record import described, main
 from experiments.trained import SHORT, trained
 from wlplan.dataset import Dataset
@@ -39,8 +40,6 @@ SEED, PILES, LOADS = 1000, 10, 40
 WORLDS = ("low", "hybrid", "high")
 OUTCOMES = ("mass", "time", "work")
 QUANTITIES = (*OUTCOMES, "volume")
-# A loading that takes longer has stalled [s].
-STALL = 15.0
 TITLES = {
     "low": "low: ψ_low, automaton",
     "hybrid": "hybrid: ψ_high, automaton",

@@ -17,6 +17,8 @@ from wlplan import training
 from wlplan.dataset import Dataset, fingerprint
 from wlplan.errors import InputError
 from wlplan.io import write_text_atomic
+from wlplan.models.ensemble import Ensemble
+from wlplan.worlds import pretrained_path
 
 # Passes over the data with which the paper's ψ_high is trained: 9 s of processor time each.
 CONVOLUTIONAL_EPOCHS = 60
@@ -45,6 +47,19 @@ PSI = {
 """The performance predictors that are compared: kind and settings, by title."""
 SHORT: dict[str, Any] = {"epochs": 2, "hidden": (32,)}
 """What a smoke preset changes of the settings."""
+SHIPPED = {f"{kind}, as it ships": kind for kind in ("psi_low", "psi_high")}
+"""The performance predictors that ship, trained on more cycles than a data set has: kind, by title.
+
+The held-out cycles of the data set are new to them too.
+"""
+
+
+def shipped(kind: str) -> tuple[Ensemble, dict[str, Any]]:
+    """An ensemble that ships, and its description."""
+    place = pretrained_path(kind)
+    model = training.load_model(place, kind)
+    assert isinstance(model, Ensemble)
+    return model, training.read_description(place, kind)
 
 
 def trained(

@@ -14,7 +14,13 @@ from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance import PerformanceModel, PsiLow
 from wlplan.models.pile_state import Phi, PileStateModel
 from wlplan.published import PERFORMANCE, PILE_STATE, SEQUENCE, SEQUENCE_LOADS
-from wlplan.training import evaluate_performance, evaluate_pile_state
+from wlplan.training import (
+    evaluate_performance,
+    evaluate_pile_state,
+    load_model,
+    read_description,
+)
+from wlplan.worlds import pretrained_path
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +51,15 @@ def test_a_performance_predictor_stands_beside_the_papers(data, capsys):
     assert one["call_s"]["repeats"] >= BATCH
     print_times(found["inference"], found["paper"]["inference_s"])
     assert "0.31 ms" in capsys.readouterr().out
+
+
+def test_an_ensemble_is_timed_with_and_without_its_deviation(data, capsys):
+    place = pretrained_path("psi_low")
+    found = evaluated(load_model(place), data, read_description(place))
+    asked = [(record["inputs"], record["deviation"]) for record in found["inference"]]
+    assert asked == [(1, False), (BATCH, False), (1, True), (BATCH, True)]
+    print_times(found["inference"], found["paper"]["inference_s"])
+    assert capsys.readouterr().out.count("with the deviation") == 2
 
 
 def test_the_papers_pile_state_model_is_judged_with_and_without_post_processing(data):

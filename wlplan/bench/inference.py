@@ -32,6 +32,7 @@ class InferenceTime:
     """Wall-clock time of calls of one compiled function [s]."""
 
     inputs: int  # of one call
+    deviation: bool  # whether an ensemble tells how far it may be off, too
     compile: float  # tracing and compiling
     call: Timing
 
@@ -44,6 +45,7 @@ class InferenceTime:
         """The times as JSON has them."""
         return {
             "inputs": self.inputs,
+            "deviation": self.deviation,
             "compile_s": self.compile,
             "call_s": dataclasses.asdict(self.call),
             "each_s": self.each,
@@ -55,8 +57,8 @@ def inference_times(
     dataset: Dataset,
     *,
     blend: bool = True,
-) -> tuple[InferenceTime, InferenceTime]:
-    """Times a predictor on one input, and on 150 in one call.
+) -> list[InferenceTime]:
+    """Times a predictor on one input, and on 150 in one call; an ensemble also with its deviation.
 
     The weights are compiled in, as in a planner: to hand them over takes a small model as long
     again.
@@ -67,29 +69,34 @@ def inference_times(
         blend: Whether the paper's pile state predictor blends with the map before along the edges.
     """
     which = jnp.arange(BATCH) % len(dataset)
-    function, inputs = _inputs(model, dataset, blend)
-    batch = tuple(jnp.asarray(values)[which] for values in inputs)
-    singles = [tuple(values[n] for values in batch) for n in range(BATCH)]
-    one, first = compiled(function, *singles[0])
-    many, second = compiled(jax.vmap(function), *batch)
-    (single,) = timed([one], singles, seconds=_SECONDS, least=1)
-    (together,) = timed([many], [batch], seconds=_SECONDS, least=_LEAST)
-    return InferenceTime(1, first, single.timing), InferenceTime(BATCH, second, together.timing)
+    times = []
+    for deviation in (False, True) if isinstance(model, Ensemble) else (False,):
+        function, inputs = _inputs(model, dataset, blend, deviation)
+        batch = tuple(jnp.asarray(values)[which] for values in inputs)
+        singles = [tuple(values[n] for values in batch) for n in range(BATCH)]
+        one, first = compiled(function, *singles[0])
+        many, second = compiled(jax.vmap(function), *batch)
+        (single,) = timed([one], singles, seconds=_SECONDS, least=1)
+        (together,) = timed([many], [batch], seconds=_SECONDS, least=_LEAST)
+        times.append(InferenceTime(1, deviation, first, single.timing))
+        times.append(InferenceTime(BATCH, deviation, second, together.timing))
+    return times
 
 
 def _inputs(
-    model: Any, dataset: Dataset, blend: bool
+    model: Any, dataset: Dataset, blend: bool, deviation: bool
 ) -> tuple[Callable[..., Any], tuple[Any, ...]]:
     """The predictor as a function of arrays, and a table of each of them."""
     seen_by = model.members if isinstance(model, Ensemble) else model
+    predict = model.with_deviation if deviation else model
     if isinstance(seen_by, PerformanceModel):
         return (
-            lambda characteristics, action: model(characteristics, action),
+            lambda characteristics, action: predict(characteristics, action),
             (dataset.characteristics, dataset.action),
         )
     if isinstance(seen_by, HighPerformanceModel):
         return (
-            lambda height, action: model(LocalHeightmap(height, CELL_SIZE, 0.0), action),
+            lambda height, action: predict(LocalHeightmap(height, CELL_SIZE, 0.0), action),
             (dataset.h36, dataset.action),
         )
 

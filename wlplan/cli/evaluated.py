@@ -55,8 +55,9 @@ def print_times(times: Sequence[Mapping[str, Any]], paper: float) -> None:
         table.add_column(column, justify="left" if not column else "right")
     for record in times:
         call, inputs = record["call_s"], record["inputs"]
+        what = "one input" if inputs == 1 else f"{inputs} inputs in one call"
         table.add_row(
-            "one input" if inputs == 1 else f"{inputs} inputs in one call",
+            f"{what}, with the deviation" if record["deviation"] else what,
             f"{1e3 * call['median']:.3f} ms",
             f"{1e3 * call['low']:.3f} to {1e3 * call['high']:.3f} ms",
             f"{1e3 * record['each_s']:.4f} ms",

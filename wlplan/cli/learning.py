@@ -345,7 +345,8 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     predictor: Any = load_model(folder, description["kind"])
     dataset = open_dataset(data)
     part = held_out(dataset, description)
-    if shares_piles(dataset, description):
+    # What was held out of its own data has piles that are new to it.
+    if part is dataset and shares_piles(dataset, description):
         seed_of = dataset.attributes["seed"]
         remark(
             f"{data} has seed {seed_of}, as a data set that the model was trained on: it has seen "

@@ -188,12 +188,13 @@ class Rollout:
         self.valid = pose is not None
         # A pile that is used up is dug where it was dug last; `valid` tells.
         self.pose = self.pose if pose is None else pose
-        slow = [load["action"] for load in self.played if load["fill_time"] >= _SLOW_FILLING]
         variation = self.variation[self.load]
-        if slow and not np.isnan(variation).any():
-            low, high = np.array(ACTION_LOW), np.array(ACTION_HIGH)
-            similar = np.clip(slow[-1] + (high - low) * variation, low, high)
-            self.action[self.load] = similar.astype(np.float32)
+        if not np.isnan(variation).any():
+            slow = [load["action"] for load in self.played if load["fill_time"] >= _SLOW_FILLING]
+            if slow:
+                low, high = np.array(ACTION_LOW), np.array(ACTION_HIGH)
+                similar = np.clip(slow[-1] + (high - low) * variation, low, high)
+                self.action[self.load] = similar.astype(np.float32)
         return self.pose, self.action[self.load]
 
     def take_in(self, height: Array, record: dict[str, Any]) -> None:

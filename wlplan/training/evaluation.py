@@ -147,6 +147,12 @@ def widening(ensemble: Ensemble, dataset: Dataset) -> Float[Array, "3"]:
     return jnp.asarray(np.array(factors, np.float32))
 
 
+def sees_map(model: PerformanceModel | HighPerformanceModel | Ensemble) -> bool:
+    """Whether a model is called with the local map; else with its four characteristics."""
+    network = model.members if isinstance(model, Ensemble) else model
+    return isinstance(network, HighPerformanceModel)
+
+
 def predict(
     model: PerformanceModel | HighPerformanceModel | Ensemble, dataset: Dataset
 ) -> Performance:
@@ -158,10 +164,8 @@ def predict_with_deviation(
     model: PerformanceModel | HighPerformanceModel | Ensemble, dataset: Dataset
 ) -> tuple[Performance, Performance | None]:
     """Prediction of each cycle and, by an ensemble, its standard deviation; leaves of shape [n]."""
-    network = model.members if isinstance(model, Ensemble) else model
-    if isinstance(network, PerformanceModel):
-        return _of_views(model, jnp.asarray(dataset.characteristics), jnp.asarray(dataset.action))
-    return _of_views(model, jnp.asarray(dataset.h36), jnp.asarray(dataset.action))
+    views = dataset.h36 if sees_map(model) else dataset.characteristics
+    return _of_views(model, jnp.asarray(views), jnp.asarray(dataset.action))
 
 
 @jax.jit

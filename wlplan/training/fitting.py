@@ -39,7 +39,7 @@ _SAVE_EVERY = 30.0
 LOSSES = ("huber", "squared")
 """What counts of an error: beyond a twentieth of the spread its size, below that its square; or
 always its square, as in the paper. Three cycles in a hundred stall and take far longer than the
-rest. They weigh so much by the square that all others suffer: ψ_low errs by 6.0 % in time; by
+rest. They weigh so much by the square that all others suffer: ψ_low errs by 5.9 % in time; by
 Huber's loss 3.1 %.
 """
 # Error from which on the size counts, in units of the spread. With a fifth ψ_high errs by a tenth

@@ -140,7 +140,7 @@ def train_phi(
     network = HeightChange(hidden, activation=activation, dropout=dropout, rngs=nnx.Rngs(seed))
     network.fit_scales(**evenly(session.tables[0]))
     # The components are not trained: what they make of the maps is the same in every epoch.
-    examples = [_components(network, table) for table in session.tables[:2]]
+    examples = [_components(network, table) for table in session.tables]
     # In units of the first component, which brings the loss to the order of one.
     spread = float(examples[0]["change"].std(axis=0).max()) or 1.0
 
@@ -188,7 +188,7 @@ def train_phi_vae(
     phi = Phi(hidden, dropout=dropout, rngs=nnx.Rngs(seed))
     mean = session.tables[0]["maps"].mean(axis=0)
     phi.mean[...] = jnp.asarray((mean + mean[:, ::-1]) / 2.0)
-    pairs = [_scaled_pairs(table, phi.mean[...]) for table in session.tables[:2]]
+    pairs = [_scaled_pairs(table, phi.mean[...]) for table in session.tables]
 
     def reconstruction(vae: Any, e: PyTree, rngs: nnx.Rngs | None) -> Array:
         code, log_variance = vae.encode(e["maps"])
@@ -213,9 +213,7 @@ def train_phi_vae(
     )
     nnx.update(phi.vae, best)
 
-    codes = [
-        _codes(phi, table, pair) for table, pair in zip(session.tables[:2], pairs, strict=True)
-    ]
+    codes = [_codes(phi, table, pair) for table, pair in zip(session.tables, pairs, strict=True)]
     assert phi.step.scale_in is not None
     assert phi.step.scale_out is not None
     phi.step.scale_in.fit(codes[0]["inputs"])

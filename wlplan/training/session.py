@@ -47,7 +47,7 @@ class Session:
 
     Attributes:
         cycles: Number of cycles of the training, the validation and the test part.
-        tables: Arrays of each part, by name.
+        tables: Arrays of the training and of the validation part, by name.
         validation: Cycles of the validation part.
         test: Cycles of the test part.
 
@@ -73,7 +73,12 @@ class Session:
         used = []
         for each in datasets:
             parts = [part.select(part.valid) for part in split(each, fractions=_FRACTIONS)]
-            rows.append([tables(part) for part in parts])
+            arrays = [tables(part) for part in parts]
+            if not all(np.isfinite(v).all() for table in arrays for v in table.values()):
+                raise InputError(
+                    "The data set holds numbers that are not finite: collect it again."
+                )
+            rows.append(arrays[:2])
             self.cycles = [n + len(part) for n, part in zip(self.cycles, parts, strict=True)]
             used.append(parts[1:])
         self.validation, self.test = (join(parts) for parts in zip(*used, strict=True))
@@ -83,8 +88,6 @@ class Session:
             {name: np.concatenate([table[name] for table in part]) for name in part[0]}
             for part in zip(*rows, strict=True)
         ]
-        if not all(np.isfinite(v).all() for table in self.tables for v in table.values()):
-            raise InputError("The data set holds numbers that are not finite: collect it again.")
         self._recipe = recipe
         self._data = {
             "fingerprints": [fingerprint(each) for each in datasets],
