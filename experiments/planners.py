@@ -15,6 +15,7 @@ from experiments.record import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planner import PLANNERS, GradientSettings, SearchSettings, play
 from wlplan.plots import png_bytes
+from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
 
 KINDS = ("conical", "triangular", "wedge")
 SLOPE_DEGREES, SEED, LOADS = 30.0, 1, 15
@@ -81,27 +82,34 @@ def _summary(outcome: wlplan.PlanResult) -> dict[str, float]:
 
 
 def draw(folder: Path) -> None:
-    """Cost of each plan in the model and in the simulator, beside each other."""
-    from matplotlib.figure import Figure
-
+    """Cost of each plan in the model and in the simulator, in one row each."""
     result = json.loads((folder / "planners.json").read_text())
     kinds = list(dict.fromkeys(row["pile"] for row in result["rows"]))
-    figure = Figure(figsize=(3.6 * len(kinds) + 0.6, 3.4), layout="constrained")
-    axes = figure.subplots(1, len(kinds), squeeze=False)[0]
-    for axis, kind in zip(axes, kinds, strict=True):
+    figure = new_figure(3.0 * len(kinds) + 1.2, 2.9)
+    panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+    for panel, kind in zip(panels, kinds, strict=True):
         rows = [row for row in result["rows"] if row["pile"] == kind]
-        for offset, where, colour in ((-0.2, "model", "#1f5fa8"), (0.2, "simulator", "#d97a1f")):
-            costs = [row[where]["cost"] for row in rows]
-            axis.bar([k + offset for k in range(len(rows))], costs, 0.38, label=where, color=colour)
-            for k, cost in enumerate(costs):
-                axis.text(k + offset, cost, f"{cost:.1f}", ha="center", va="bottom", fontsize=7)
-        names = [row["planner"] for row in rows]
-        axis.set_xticks(range(len(rows)), names, rotation=35, ha="right", rotation_mode="anchor")
-        axis.set_title(f"{kind}, {result['slope_degrees']:g}°")
-        lowest = min(row[where]["cost"] for row in rows for where in ("model", "simulator"))
-        axis.set_ylim(0.9 * lowest)
-    axes[0].set_ylabel(f"cost of {result['loads']} loads (axis starts above 0)")
-    axes[0].legend(frameon=False)
+        costs = {where: [row[where]["cost"] for row in rows] for where in ("model", "simulator")}
+        places = range(len(rows))
+        panel.hlines(places, costs["model"], costs["simulator"], color=FAINT, lw=1.0)
+        panel.plot(costs["model"], places, "o", ms=5, mfc="white", color=BLUE, label="model")
+        panel.plot(costs["simulator"], places, "o", ms=5, color=ORANGE, label="simulator")
+        for place, pair in zip(places, zip(*costs.values(), strict=True), strict=True):
+            told = ", ".join(f"{cost:.1f}" for cost in pair)
+            panel.annotate(
+                told, (max(pair), place), (6, 0), textcoords="offset points", va="center", size=7
+            )
+        # Room for what is written beside the last point.
+        panel.set_xmargin(0.1)
+        low, high = panel.get_xlim()
+        panel.set_xlim(low, high + 0.25 * (high - low))
+        panel.set_yticks(places, [row["planner"] for row in rows], fontsize=8)
+        panel.set_title(f"{kind}, {result['slope_degrees']:g}°", fontsize=9)
+        panel.set_xlabel(f"cost of {result['loads']} loads; written: model, simulator", fontsize=8)
+        tidy(panel)
+    panels[0].invert_yaxis()
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     write_bytes_atomic(folder / "planners.png", png_bytes(figure))
 
 
