@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from wlplan import cli
 from wlplan.automaton import relax
 from wlplan.dataset import VARIABLES, Dataset, differences, probes, probes_of
 from wlplan.diggability import edge_poses
@@ -163,6 +164,22 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(tmp_path,
     shutil.rmtree(tmp_path / "out")
     train_all(tmp_path / "d.zarr", tmp_path / "out", seed=4, progress=call["progress"])
     assert trained[4:] == [("psi_low", 4), ("psi_high", 4), ("phi", 4)]
+
+
+def test_what_was_trained_and_what_was_kept_is_told(tmp_path, monkeypatch, capsys):
+    def train_all(data, out, *, seed, epochs, progress):
+        progress("cycles, d.zarr", 10, 10)
+        progress("psi_high", 60, 60)
+        return {kind: read_description(pretrained_path(kind), kind)["held_out"] for kind in SHIPPED}
+
+    monkeypatch.setattr("wlplan.training.train_all", train_all)
+    code = cli.main(["train", "all", "--data", str(tmp_path / "d.zarr"), "--out", str(tmp_path)])
+    assert code == 0
+    *_, time, written, kept = capsys.readouterr().out.strip().splitlines()
+    assert time.startswith("collecting and training")
+    assert written == f"written: {tmp_path / 'psi_high'}"
+    others = f"{tmp_path / 'phi'}, {tmp_path / 'psi_low'}"
+    assert kept == f"kept, being of the same data, settings and versions: {others}"
 
 
 def test_every_model_that_a_world_needs_is_trained():

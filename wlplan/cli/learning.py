@@ -297,14 +297,14 @@ def train(
 def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: bool) -> None:
     from wlplan.training import train_all
 
-    with Progress() as progress, Stopwatch() as training:
-        reports = train_all(
-            data,
-            out,
-            seed=seed,
-            epochs=epochs,
-            progress=lambda stage, done, total: progress(stage, done, total, None),
-        )
+    stages = set()
+    with Progress() as progress, Stopwatch() as work:
+
+        def tell(stage: str, done: int, total: int) -> None:
+            stages.add(stage)
+            progress(stage, done, total, None)
+
+        reports = train_all(data, out, seed=seed, epochs=epochs, progress=tell)
     if as_json:
         click.echo(json_text({"model": "all", "out": out, "held_out": reports}))
         return
@@ -314,8 +314,14 @@ def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: b
             print_pile_state(title, [("ours", report)])
         else:
             print_errors(title, report)
-    print(f"training {training.text()}")
-    print(f"written: {', '.join(str(Path(out) / kind) for kind in reports)}")
+    print(f"collecting and training {work.text()}")
+    for trained, words in (
+        (True, "written"),
+        (False, "kept, being of the same data, settings and versions"),
+    ):
+        places = [str(Path(out) / kind) for kind in reports if (kind in stages) is trained]
+        if places:
+            print(f"{words}: {', '.join(places)}")
 
 
 @click.command()
