@@ -203,6 +203,23 @@ def test_the_errors_are_those_of_the_papers_formulas(data):
     assert errors.cycles == 240
 
 
+def test_what_a_code_holds_of_a_map_moves_with_it(data):
+    phi = Phi((8,), rngs=nnx.Rngs(0))
+    phi.mean[...] = jnp.asarray(data.h52.mean(axis=0))
+    graph, params = nnx.split(phi)
+    model = PileStateModel(params, graph)
+    height = jnp.asarray(data.h52[3])
+    held = model.reconstruction(local(height))
+    assert held.shape == height.shape
+    np.testing.assert_allclose(model.reconstruction(local(height + 0.5)), held + 0.5, atol=1e-4)
+    # The decoder alone tells what comes out: one that always says 0 leaves the least height.
+    for layer in phi.vae.up:
+        layer.kernel[...] = jnp.zeros_like(layer.kernel)
+        layer.bias[...] = jnp.zeros_like(layer.bias)
+    empty = PileStateModel(nnx.split(phi)[1], graph).reconstruction(local(height))
+    np.testing.assert_allclose(empty - phi.mean[...], (height - phi.mean[...]).min(), atol=1e-5)
+
+
 def test_both_stages_of_the_paper_are_trained(data, tmp_path):
     done = []
     _, errors = train_phi_vae(

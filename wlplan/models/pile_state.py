@@ -174,6 +174,21 @@ class PileStateModel(struct.PyTreeNode):
         predicted = mean + low + span * phi.vae.decode(after)
         return blended(predicted, local.height) if blend else predicted
 
+    def reconstruction(self, local: LocalHeightmap) -> Float[Array, "52 52"]:
+        """What is left of a map in its code [m]: no prediction is sharper than this.
+
+        Args:
+            local: Local heightmap of 52 × 52 cells.
+
+        Raises:
+            InputError: If the map has another number of cells.
+        """
+        check_cells(local)
+        phi = nnx.merge(self.graph, self.params)
+        mean = phi.mean[...]
+        unit, low, span = scaled(local.height, mean)
+        return mean + low + span * phi.vae.decode(phi.vae.encode(unit)[0])
+
 
 def check_cells(local: LocalHeightmap) -> None:
     """Refuses a local heightmap that is not of the pile state predictor's size.

@@ -68,11 +68,9 @@ def evaluate_pile_state(
     dataset = dataset.select(dataset.valid)
     if not len(dataset):
         raise InputError("No cycle is valid: there is nothing to evaluate on.")
-    before, known = jnp.asarray(dataset.h52), jnp.asarray(_known(dataset))
-    predicted = np.asarray(_predict(model, before, known, blend), np.float64)
-    after = dataset.h52_after.astype(np.float64)
-    wrong = np.abs(predicted - after).sum(axis=(1, 2)) * CELL_SIZE**2
-    under = np.abs(after).sum(axis=(1, 2)) * CELL_SIZE**2
+    predicted = predict_pile_state(model, dataset, blend=blend).astype(np.float64)
+    wrong = misplaced_volume(predicted, dataset)
+    under = np.abs(dataset.h52_after.astype(np.float64)).sum(axis=(1, 2)) * CELL_SIZE**2
     left = (dataset.h52.astype(np.float64) - predicted).sum() * CELL_SIZE**2
     loaded = _known(dataset)[:, 4].astype(np.float64).sum()
     return PileStateErrors(
@@ -83,7 +81,24 @@ def evaluate_pile_state(
     )
 
 
-def _predict(model: Any, before: Array, known: Array, blend: bool) -> Array:
+def misplaced_volume(
+    predicted: Float[np.ndarray, "n 52 52"], dataset: Dataset
+) -> Float[np.ndarray, " n"]:
+    """Volume between predicted and simulated surface of each cycle [m³]. Paper, equation 15.
+
+    Args:
+        predicted: Maps after the loading, over the reference of those before [m].
+        dataset: The cycles.
+    """
+    wrong = np.abs(predicted - dataset.h52_after.astype(np.float64))
+    return wrong.sum(axis=(1, 2)) * CELL_SIZE**2
+
+
+def predict_pile_state(
+    model: HeightChangeModel | PileStateModel, dataset: Dataset, *, blend: bool = True
+) -> Float[np.ndarray, "n 52 52"]:
+    """Maps after the loading [m], over the reference of those before; see `evaluate_pile_state`."""
+
     @jax.jit
     def run(model: Any, before: Array, known: Array) -> Array:
         def one(cycle: tuple[Array, Array]) -> Array:
@@ -96,7 +111,7 @@ def _predict(model: Any, before: Array, known: Array, blend: bool) -> Array:
 
         return jax.lax.map(one, (before, known), batch_size=_CHUNK)
 
-    return run(model, before, known)
+    return np.asarray(run(model, jnp.asarray(dataset.h52), jnp.asarray(_known(dataset))))
 
 
 def train_phi(
