@@ -160,9 +160,12 @@ def draw(folder: Path) -> None:
         )
     spread.set_xlabel("misplaced volume [m³]; last bin: all above", fontsize=8)
     spread.set_ylabel("held-out cycles", fontsize=8)
-    spread.legend(fontsize=7, frameon=False)
+    spread.set_ylim(top=1.45 * spread.get_ylim()[1])
+    spread.legend(fontsize=7, frameon=False, loc="upper right")
     for panel, across, up in ((pairs, PLAIN, BLENDED), (both, BLENDED, OURS)):
-        panel.plot(misplaced[across], misplaced[up], ".", ms=2.5, alpha=0.5, color=COLOURS[up])
+        # What lies beyond lies on the edge.
+        points = [np.minimum(misplaced[title], most) for title in (across, up)]
+        panel.plot(*points, ".", ms=2.5, alpha=0.5, color=COLOURS[up], clip_on=False)
         panel.plot([0.0, most], [0.0, most], color=FAINT, lw=0.8)
         panel.set_xlim(0.0, most)
         panel.set_ylim(0.0, most)
@@ -172,7 +175,9 @@ def draw(folder: Path) -> None:
     for number, sample in enumerate(result["samples"]):
         at = [np.clip(sample["misplaced_m3"][title], 0.0, most) for title in (PLAIN, BLENDED)]
         pairs.plot(*at, "D", ms=5, mfc="white", color=INK, clip_on=False)
-        pairs.annotate("abcde"[number], at, (5, -8), textcoords="offset points", size=8)
+        pairs.annotate(
+            "abcde"[number], at, (6, -9 + 3 * number), textcoords="offset points", size=8
+        )
     for panel in (spread, pairs, both):
         tidy(panel)
     write_bytes_atomic(folder / "pile_state.png", png_bytes(figure))
