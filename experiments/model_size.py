@@ -119,7 +119,15 @@ def draw(folder: Path) -> None:
     for panel in below:
         panel.set_xlabel("parameters that are trained", fontsize=8, color=FAINT)
     handles, labels = above[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=7, frameon=False)
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=2,
+        fontsize=7,
+        frameon=False,
+        handlelength=4,
+    )
     write_bytes_atomic(folder / "model_size.png", png_bytes(figure))
 
 

@@ -26,7 +26,7 @@ NAMES = sorted(
     if module.name not in OTHERS
 )
 # Whose full preset has not been run yet: `experiments/README.md` says so.
-NOT_RUN: set[str] = {"model_size"}
+NOT_RUN: set[str] = set()
 
 
 def test_there_are_experiments_and_each_can_run_and_draw():

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Callable
 from typing import Any, no_type_check
 
 import jax.numpy as jnp
@@ -165,13 +166,11 @@ class PileStateModel(struct.PyTreeNode):
         Raises:
             InputError: If the map has another number of cells.
         """
-        check_cells(local)
-        phi = nnx.merge(self.graph, self.params)
-        mean = phi.mean[...]
-        before, low, span = scaled(local.height, mean)
-        code, _ = phi.vae.encode(before)
-        after = phi.step(jnp.concatenate([code, action, span[None]]))
-        predicted = mean + low + span * phi.vae.decode(after)
+
+        def step(phi: Phi, code: Array, span: Array) -> Array:
+            return phi.step(jnp.concatenate([code, action, span[None]]))
+
+        predicted = self._by_code(local, step)
         return blended(predicted, local.height) if blend else predicted
 
     def reconstruction(self, local: LocalHeightmap) -> Float[Array, "52 52"]:
@@ -183,11 +182,18 @@ class PileStateModel(struct.PyTreeNode):
         Raises:
             InputError: If the map has another number of cells.
         """
+        return self._by_code(local, lambda phi, code, span: code)
+
+    def _by_code(
+        self, local: LocalHeightmap, change: Callable[[Phi, Array, Array], Array]
+    ) -> Float[Array, "52 52"]:
+        """The map of the code of a map [m], once `change` of φ, code and range is made to it."""
         check_cells(local)
         phi = nnx.merge(self.graph, self.params)
         mean = phi.mean[...]
         unit, low, span = scaled(local.height, mean)
-        return mean + low + span * phi.vae.decode(phi.vae.encode(unit)[0])
+        code, _ = phi.vae.encode(unit)
+        return mean + low + span * phi.vae.decode(change(phi, code, span))
 
 
 def check_cells(local: LocalHeightmap) -> None:
