@@ -43,7 +43,7 @@ from wlplan.models.ensemble import Ensemble
 from wlplan.models.performance import PerformanceModel
 from wlplan.models.performance_high import HighPerformanceModel
 from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
+from wlplan.plots.paper import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, tidy
 from wlplan.training.evaluation import sees_map
 from wlplan.types import Pile, Pose
 from wlplan.units import CELL_SIZE
@@ -62,7 +62,7 @@ PARTS = {
 # 0.5 m, 3 degrees and 5 %, about as far as a planner moves.
 STEPS = {"1e-6": 1e-6, "0.01": 1e-2, "0.1": 1e-1, "0.5": 0.5}
 MODELS = tuple(title for title in PSI if "of the paper" not in title)
-COLOURS = {"swish": BLUE, "leaky relu": ORANGE, "as it ships": "#3a7d44"}
+COLOURS = {"swish": BLUE, "leaky relu": ORANGE, "as it ships": GREEN}
 
 
 def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:

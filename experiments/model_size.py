@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from flax import nnx
 
+from experiments.learning_curve import MODELS
 from experiments.record import described, main
 from experiments.trained import SHORT, trained
 from wlplan.bench.inference import inference_times
@@ -24,13 +25,10 @@ from wlplan.plots import png_bytes
 from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.published import PERFORMANCE
 from wlplan.training import evaluate_performance
+from wlplan.training.evaluation import QUANTITIES
 
 LAYERS, UNITS = (1, 2, 3), (8, 32, 128, 512)
-# Hidden layers by default: `experiments.performance` has them trained.
-USUAL = (512, 512)
 EPOCHS = 150
-MODELS = {"psi_low": "ψ_low", "psi_high": "ψ_high (ours)"}
-NAMES = ("mass", "time", "work")
 # Sizes of the paper's models of special interest, from its text.
 PARAMETERS = {"psi_low": 5e5, "psi_high": 1e7}
 
@@ -42,11 +40,10 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     layers, units = ((1, 2), (8,)) if smoke else (LAYERS, UNITS)
     rows = []
     for kind, count, each in itertools.product(MODELS, layers, units):
-        hidden = (each,) * count
-        settings: dict[str, Any] = {} if hidden == USUAL else {"hidden": hidden}
-        if smoke:
-            settings = SHORT | settings
-        model, seconds = trained(models, data, kind, activation="swish", **settings)
+        epochs = SHORT["epochs"] if smoke else EPOCHS
+        model, seconds = trained(
+            models, data, kind, activation="swish", hidden=(each,) * count, epochs=epochs
+        )
         one, batch = inference_times(model, test)
         rows.append(
             {
@@ -57,7 +54,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
                 "mean_relative": evaluate_performance(model, test).every.mean_relative,
                 "inference_s": one.call.median,
                 "inference_of_a_batch_s": batch.each,
-                "epoch_s": None if seconds is None else seconds / settings.get("epochs", EPOCHS),
+                "epoch_s": None if seconds is None else seconds / epochs,
             }
         )
     return {
@@ -85,7 +82,7 @@ def draw(folder: Path) -> None:
     columns = [
         *(
             (panel, f"{n}, mean relative error [%]", n)
-            for panel, n in zip(above, NAMES, strict=True)
+            for panel, n in zip(above, QUANTITIES, strict=True)
         ),
         (below[0], "inference of one input [ms]", "inference_s"),
         (below[1], f"of each of {result['batch']} [ms]", "inference_of_a_batch_s"),
@@ -98,7 +95,7 @@ def draw(folder: Path) -> None:
             for depth in depths:
                 rows = [r for r in result["rows"] if (r["kind"], r["layers"]) == (kind, depth)]
                 size = [row["parameters"] for row in rows]
-                if name in NAMES:
+                if name in QUANTITIES:
                     values = [100.0 * row["mean_relative"][name] for row in rows]
                 else:
                     factor = 1.0 if name == "epoch_s" else 1e3
@@ -106,7 +103,7 @@ def draw(folder: Path) -> None:
                 label = f"{MODELS[kind]}, {depth} hidden layer{'s' if depth > 1 else ''}"
                 panel.plot(size, values, "o", ls=styles[depth], ms=3, color=colour, label=label)
             paper = result["paper"][kind]
-            papers = {n: 100.0 * paper[n] for n in NAMES} | {
+            papers = {n: 100.0 * paper[n] for n in QUANTITIES} | {
                 "inference_s": 1e3 * paper["inference"]
             }
             if name in papers:

@@ -38,7 +38,7 @@ from wlplan.heightmap import PERFORMANCE_CELLS, STATE_CELLS, STATE_DISPLACEMENT
 from wlplan.io import write_bytes_atomic
 from wlplan.models.performance import PerformanceModel
 from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.plots.paper import BLUE, FAINT, ORANGE, PALE, new_figure, tidy
 from wlplan.simulator import dig
 from wlplan.training.evaluation import predict
 from wlplan.types import Action
@@ -218,7 +218,7 @@ def draw(folder: Path) -> None:
     kinds = list(result["floor"])
     for panel, quantity in zip(panels, NAMES, strict=True):
         values = [100.0 * result["floor"][kind][quantity] for kind in kinds]
-        bars = panel.barh(range(len(kinds)), values, color="#c9ced4", height=0.6)
+        bars = panel.barh(range(len(kinds)), values, color=PALE, height=0.6)
         panel.bar_label(bars, fmt="%.2g", padding=2, fontsize=7, color=FAINT)
         for title, errors in result["error"].items():
             colour = BLUE if "low" in title else ORANGE

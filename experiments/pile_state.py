@@ -23,10 +23,14 @@ from wlplan.heightmap import STATE_DISPLACEMENT
 from wlplan.io import write_bytes_atomic
 from wlplan.models.pile_state import PileStateModel
 from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
+from wlplan.plots.paper import BLUE, FAINT, GREEN, INK, ORANGE, PALE, new_figure, tidy
 from wlplan.published import PILE_STATE
-from wlplan.training import evaluate_pile_state, load_model
-from wlplan.training.pile_state import misplaced_volume, predict_pile_state
+from wlplan.training import load_model
+from wlplan.training.pile_state import (
+    misplaced_volume,
+    pile_state_errors,
+    predict_pile_state,
+)
 from wlplan.types import LocalHeightmap
 from wlplan.units import CELL_SIZE
 from wlplan.worlds import pretrained_path
@@ -35,7 +39,7 @@ from wlplan.worlds import pretrained_path
 SEEDS = 5
 PLAIN, BLENDED = "paper's φ, as predicted", "paper's φ, edges blended"
 OURS, SHIPS = "ours", "ours, as it ships"
-COLOURS = {PLAIN: "#c9ced4", BLENDED: ORANGE, OURS: BLUE, SHIPS: "#3a7d44"}
+COLOURS = {PLAIN: PALE, BLENDED: ORANGE, OURS: BLUE, SHIPS: GREEN}
 # Samples of small, middling and large errors of the blended prediction: their places in the order.
 PLACES = {"small": 0.02, "median": 0.5, "large": 0.98}
 # Error of the surface from which on a sample has its full colour [m].
@@ -51,19 +55,19 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     papers, _ = trained(models, data, "phi_vae", **short)
     ours = [trained(models, data, "phi", seed=s, **short)[0] for s in range(1 if smoke else SEEDS)]
     ships: Any = load_model(pretrained_path("phi"), "phi")
-    predicted = {
-        PLAIN: predict_pile_state(papers, test, blend=False),
-        BLENDED: predict_pile_state(papers, test),
-        OURS: predict_pile_state(ours[0], test),
-        SHIPS: predict_pile_state(ships, test),
+    # By every training of each; what is drawn is of the first.
+    all_predicted = {
+        PLAIN: [predict_pile_state(papers, test, blend=False)],
+        BLENDED: [predict_pile_state(papers, test)],
+        OURS: [predict_pile_state(model, test) for model in ours],
+        SHIPS: [predict_pile_state(ships, test)],
     }
-    misplaced = {title: misplaced_volume(maps, test) for title, maps in predicted.items()}
     errors = {
-        PLAIN: [evaluate_pile_state(papers, test, blend=False)],
-        BLENDED: [evaluate_pile_state(papers, test)],
-        OURS: [evaluate_pile_state(model, test) for model in ours],
-        SHIPS: [evaluate_pile_state(ships, test)],
+        title: [pile_state_errors(maps, test) for maps in trainings]
+        for title, trainings in all_predicted.items()
     }
+    predicted = {title: trainings[0] for title, trainings in all_predicted.items()}
+    misplaced = {title: misplaced_volume(maps, test) for title, maps in predicted.items()}
     coded = _reconstructed(papers, test.h52)
     return {
         "data": described(data),

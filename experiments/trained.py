@@ -88,7 +88,8 @@ def trained(
     }
     recipe = hashlib.sha256(repr(sorted(defaults.items())).encode()).hexdigest()
     words = [kind, fingerprint(data).removeprefix("sha256:")[:8], recipe[:4], f"seed{seed}"]
-    for name, value in sorted(settings.items()):
+    # Whoever names a default and whoever does not share a model.
+    for name, value in sorted((n, v) for n, v in settings.items() if v != defaults.get(n)):
         text = "x".join(map(str, value)) if isinstance(value, tuple) else str(value)
         words.append(f"{name}-{text}")
     folder = models / "_".join(words)

@@ -33,6 +33,8 @@ def test_a_model_is_trained_once_and_found_again(tmp_path, monkeypatch):
         refuses = functools.wraps(training.train_psi_low)(lambda *_, **__: 1 / 0)
         patched.setattr("wlplan.training.train_psi_low", refuses)
         again, same = trained(tmp_path, data, "psi_low", **settings)
+        # Swish is the default: to name it makes no other model.
+        trained(tmp_path, data, "psi_low", **{k: settings[k] for k in ("epochs", "hidden")})
     assert same == seconds
     inputs = jnp.asarray(data.characteristics[0]), jnp.asarray(data.action[0])
     assert first(*inputs).mass == again(*inputs).mass

@@ -14,7 +14,7 @@ from wlplan.bench.timing import Timing, compiled, timed
 from wlplan.dataset import Dataset
 from wlplan.heightmap import STATE_DISPLACEMENT
 from wlplan.machine import GRAVEL
-from wlplan.models.ensemble import Ensemble
+from wlplan.models.ensemble import Ensemble, members_of
 from wlplan.models.height_change import HeightChangeModel
 from wlplan.models.performance import PerformanceModel
 from wlplan.models.performance_high import HighPerformanceModel
@@ -87,7 +87,7 @@ def _inputs(
     model: Any, dataset: Dataset, blend: bool, deviation: bool
 ) -> tuple[Callable[..., Any], tuple[Any, ...]]:
     """The predictor as a function of arrays, and a table of each of them."""
-    seen_by = model.members if isinstance(model, Ensemble) else model
+    seen_by = members_of(model)
     predict = model.with_deviation if deviation else model
     if isinstance(seen_by, PerformanceModel):
         return (

@@ -73,3 +73,8 @@ class Ensemble(struct.PyTreeNode):
             jax.tree.map(lambda values: values.mean(axis=0), each),
             jax.tree.map(deviation, each, own, Performance(*self.factor)),
         )
+
+
+def members_of(model: Any) -> Any:
+    """The members of an ensemble; any other model itself."""
+    return model.members if isinstance(model, Ensemble) else model

@@ -17,8 +17,10 @@ from wlplan.io import write_bytes_atomic
 # Colours that people with the common kinds of colour blindness tell apart.
 INK = "#1d2733"
 FAINT = "#6b7785"
+PALE = "#c9ced4"
 BLUE = "#1f5fa8"
 ORANGE = "#d9700a"
+GREEN = "#3a7d44"
 # Width of one map on paper [inch].
 PANEL_WIDTH = 5.6
 

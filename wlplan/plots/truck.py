@@ -10,7 +10,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
-from wlplan.plots.paper import INK, add_arrow
+from wlplan.plots.paper import INK, PALE, add_arrow
 from wlplan.transport import Receiver
 
 _TRUCK_REACH = 0.75
@@ -82,9 +82,7 @@ def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> Non
     panel.add_patch(
         Polygon(truck.body, closed=True, facecolor=INK, edgecolor="white", linewidth=0.8, zorder=6)
     )
-    panel.add_patch(
-        Polygon(truck.bed, closed=True, facecolor="#c9ced4", edgecolor="none", zorder=7)
-    )
+    panel.add_patch(Polygon(truck.bed, closed=True, facecolor=PALE, edgecolor="none", zorder=7))
     add_arrow(panel, *truck.way, colour=INK, line=1.6, head=11.0, zorder=7)
     panel.annotate(
         "truck",

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from wlplan.dataset import Dataset
 from wlplan.errors import InputError
-from wlplan.models.ensemble import PERCENT_90, Ensemble
+from wlplan.models.ensemble import PERCENT_90, Ensemble, members_of
 from wlplan.models.performance import PerformanceModel
 from wlplan.models.performance_high import HighPerformanceModel
 from wlplan.types import LocalHeightmap, Performance
@@ -149,8 +149,7 @@ def widening(ensemble: Ensemble, dataset: Dataset) -> Float[Array, "3"]:
 
 def sees_map(model: PerformanceModel | HighPerformanceModel | Ensemble) -> bool:
     """Whether a model is called with the local map; else with its four characteristics."""
-    network = model.members if isinstance(model, Ensemble) else model
-    return isinstance(network, HighPerformanceModel)
+    return isinstance(members_of(model), HighPerformanceModel)
 
 
 def predict(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -68,7 +69,16 @@ def evaluate_pile_state(
     dataset = dataset.select(dataset.valid)
     if not len(dataset):
         raise InputError("No cycle is valid: there is nothing to evaluate on.")
-    predicted = predict_pile_state(model, dataset, blend=blend).astype(np.float64)
+    return pile_state_errors(predict_pile_state(model, dataset, blend=blend), dataset)
+
+
+def pile_state_errors(predicted: Float[np.ndarray, "n 52 52"], dataset: Dataset) -> PileStateErrors:
+    """The errors of predicted maps, see `evaluate_pile_state`.
+
+    Args:
+        predicted: Maps after the loading, over the reference of those before [m].
+        dataset: The cycles.
+    """
     wrong = misplaced_volume(predicted, dataset)
     under = np.abs(dataset.h52_after.astype(np.float64)).sum(axis=(1, 2)) * CELL_SIZE**2
     left = (dataset.h52.astype(np.float64) - predicted).sum() * CELL_SIZE**2
@@ -98,20 +108,21 @@ def predict_pile_state(
     model: HeightChangeModel | PileStateModel, dataset: Dataset, *, blend: bool = True
 ) -> Float[np.ndarray, "n 52 52"]:
     """Maps after the loading [m], over the reference of those before; see `evaluate_pile_state`."""
+    before, known = jnp.asarray(dataset.h52), jnp.asarray(_known(dataset))
+    return np.asarray(_predicted(model, before, known, blend=blend))
 
-    @jax.jit
-    def run(model: Any, before: Array, known: Array) -> Array:
-        def one(cycle: tuple[Array, Array]) -> Array:
-            height, known = cycle
-            local = LocalHeightmap(height, CELL_SIZE, STATE_DISPLACEMENT)
-            if isinstance(model, PileStateModel):
-                return model(local, known[:4], blend=blend)
-            ground = jnp.full_like(height, height.min())
-            return height + model(local, known[:4], known[4], ground)
 
-        return jax.lax.map(one, (before, known), batch_size=_CHUNK)
+@partial(jax.jit, static_argnames="blend")
+def _predicted(model: Any, before: Array, known: Array, *, blend: bool) -> Array:
+    def one(cycle: tuple[Array, Array]) -> Array:
+        height, known = cycle
+        local = LocalHeightmap(height, CELL_SIZE, STATE_DISPLACEMENT)
+        if isinstance(model, PileStateModel):
+            return model(local, known[:4], blend=blend)
+        ground = jnp.full_like(height, height.min())
+        return height + model(local, known[:4], known[4], ground)
 
-    return np.asarray(run(model, jnp.asarray(dataset.h52), jnp.asarray(_known(dataset))))
+    return jax.lax.map(one, (before, known), batch_size=_CHUNK)
 
 
 def train_phi(

@@ -25,7 +25,7 @@ from wlplan.heightmap import (
     STATE_CELLS,
     STATE_DISPLACEMENT,
 )
-from wlplan.models.ensemble import Ensemble
+from wlplan.models.ensemble import Ensemble, members_of
 from wlplan.models.height_change import HeightChange, HeightChangeModel
 from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel, PsiLow
@@ -59,7 +59,7 @@ _KINDS: dict[str, tuple[Any, Any, dict[str, int]]] = {
 
 def kind_of(model: Model) -> str:
     """The name under which a model is saved."""
-    made = type(model.members if isinstance(model, Ensemble) else model)
+    made = type(members_of(model))
     return next(kind for kind, (known, _, _) in _KINDS.items() if known is made)
 
 
@@ -112,7 +112,7 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
     directory = Path(directory)
     check_target(directory)
     kind = kind_of(model)
-    member: Any = model.members if isinstance(model, Ensemble) else model
+    member = members_of(model)
     network = nnx.merge(member.graph, member.params)
     # Arrays of the host: the checkpoint then holds no devices, and loads on any.
     weights = jax.tree.map(np.asarray, nnx.to_pure_dict(member.params))

@@ -67,7 +67,8 @@ def train_all(
         out: Directory of the models, each in one of its own: `psi_low`, `psi_high`, `phi`.
         seed: Seed of collection and training.
         epochs: Passes over the data for every model; None: of each its own.
-        progress: Called with what is done, how far it is, and how far it goes.
+        progress: Called with what is done, how far it is, and how far it goes; of a training with
+            the kind of the model, of one that is kept not at all.
 
     Returns:
         The errors of each model on the test part, as JSON has them.
