@@ -60,9 +60,10 @@ lint: $(VENV)/.tools
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
 
 weights: $(VENV)/.package
 	$(BIN)/wlplan train all --data out/cycles.zarr --out wlplan/pretrained
 
 clean:
-	rm -rf $(VENV) demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) demo build dist .import_linter_cache *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -18,21 +18,21 @@ from jaxtyping import Float
 
 from experiments.record import main
 from experiments.replays import in_batches
-from wlplan.characteristics import as_vector, characteristics
-from wlplan.heightmap import (
+from wlplan.constants import ACTION_HIGH, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
+from wlplan.engines.simulator import Settings, dig
+from wlplan.io import write_bytes_atomic
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import FAINT, new_figure
+from wlplan.site.machine import WA320
+from wlplan.terrain.characteristics import as_vector, characteristics
+from wlplan.terrain.heightmap import (
     PERFORMANCE_CELLS,
     PERFORMANCE_DISPLACEMENT,
     STATE_CELLS,
     STATE_DISPLACEMENT,
     local_axes,
 )
-from wlplan.io import write_bytes_atomic
-from wlplan.machine import WA320
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import FAINT, new_figure
-from wlplan.simulator import Settings, dig
 from wlplan.types import LocalHeightmap
-from wlplan.units import ACTION_HIGH, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 
 # Slope and incidence [degrees], curvature along and across [1/m]. The first is what the others are
 # compared with.

@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.record import main
-from wlplan.automaton import DEFAULT_SCHEDULE, Schedule, converged, settle, steepest_slope
-from wlplan.bench.digs import Dig, random_digs
-from wlplan.heightmap import sample
+from wlplan.constants import CELL_SIZE
 from wlplan.io import write_bytes_atomic
-from wlplan.machine import GRAVEL
-from wlplan.plots import png_bytes
+from wlplan.report.figures import png_bytes
+from wlplan.site.soil import GRAVEL
+from wlplan.studies.bench.digs import Dig, random_digs
+from wlplan.terrain.automaton import DEFAULT_SCHEDULE, Schedule, converged, settle, steepest_slope
+from wlplan.terrain.heightmap import sample
 from wlplan.types import Pile
-from wlplan.units import CELL_SIZE
 
 SEED, DIGS, SMOKE_DIGS = 0, 100, 6
 # Of digs on which no schedule was chosen, judged on the whole pile.

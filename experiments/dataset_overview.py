@@ -16,13 +16,13 @@ from scipy import stats
 
 from experiments.record import described, main
 from experiments.replays import in_batches, surfaces
+from wlplan.constants import J_PER_KJ, KG_PER_TONNE
 from wlplan.dataset import Dataset
+from wlplan.engines.simulator import dig
 from wlplan.io import write_bytes_atomic
-from wlplan.machine import WA320, WheelLoader
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
-from wlplan.simulator import dig
-from wlplan.units import J_PER_KJ, KG_PER_TONNE
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.site.machine import WA320, WheelLoader
 
 SEED = 0
 # Outcomes with their unit, and the range that the paper gives for its data set (appendix A).

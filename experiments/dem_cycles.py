@@ -20,14 +20,15 @@ from typing import Any
 import numpy as np
 
 from experiments.dem_reference import MACHINE
-from wlplan.dem import columns, process
-from wlplan.dem.cycle import Played
-from wlplan.dem.grains import Settings
-from wlplan.dem.loader import RECORDED
+from wlplan.constants import ACTION_HIGH, ACTION_LOW, J_PER_KJ, KG_PER_TONNE
+from wlplan.engines.dem import columns, process
+from wlplan.engines.dem.cycle import Played
+from wlplan.engines.dem.grains import Settings
+from wlplan.engines.dem.loader import RECORDED
 from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic
-from wlplan.machine import GRAVEL, WA320, WheelLoader
-from wlplan.units import ACTION_HIGH, ACTION_LOW, J_PER_KJ, KG_PER_TONNE
+from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.soil import GRAVEL
 
 MACHINES = {"reference": MACHINE, "wa320": WA320}
 """Machines by name: "reference" has the constants of the cycles in tests/references."""
@@ -51,7 +52,7 @@ _ROWS = 640
 
 
 def seed_surface(rng: np.random.Generator, shape: str) -> tuple[np.ndarray, dict[str, float]]:
-    """A pile in the frame of its dig location on the grid of `wlplan.dem.columns`.
+    """A pile in the frame of its dig location on the grid of `wlplan.engines.dem.columns`.
 
     Args:
         rng: Source of its slope, direction and bumps.
@@ -87,7 +88,7 @@ def at_new_toe(height: np.ndarray, width: float) -> np.ndarray:
     """The same pile in the frame of a dig location at the toe that is there now.
 
     Args:
-        height: Heights on the grid of `wlplan.dem.columns` [m].
+        height: Heights on the grid of `wlplan.engines.dem.columns` [m].
         width: Of the bucket [m].
     """
     x, y = columns.axes()

@@ -23,13 +23,14 @@ from jaxtyping import Array
 from scipy import ndimage
 
 from experiments.record import main
-from wlplan.automaton import relax
+from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
+from wlplan.engines.simulator import STOP_REASONS, Cycle, dig, terrain
 from wlplan.io import write_bytes_atomic
-from wlplan.machine import GRAVEL, WA320
-from wlplan.plots import png_bytes
-from wlplan.simulator import STOP_REASONS, Cycle, dig, terrain
+from wlplan.report.figures import png_bytes
+from wlplan.site.machine import WA320
+from wlplan.site.soil import GRAVEL
+from wlplan.terrain.automaton import relax
 from wlplan.types import Action, Pile, action_from
-from wlplan.units import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 
 _FOLDER = Path(__file__).parents[1] / "tests" / "references"
 REFERENCE = _FOLDER / "dem_cycles.npz"

@@ -17,13 +17,13 @@ from jaxtyping import Float
 
 from experiments.record import described, main
 from experiments.trained import PSI, SHIPPED, SHORT, shipped, trained
+from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
-from wlplan.machine import WA320
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
+from wlplan.site.machine import WA320
 from wlplan.training.evaluation import predict
-from wlplan.units import CELL_SIZE
 
 MODELS = ("psi_low, swish", "psi_high, swish")
 OUTCOMES = {"mass": "t", "time": "s", "work": "kJ"}

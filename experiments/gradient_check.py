@@ -9,12 +9,12 @@ from typing import Any
 
 import wlplan
 from experiments.record import main
-from wlplan.gradcheck import COMPONENTS, TOLERANCE, check_gradient, random_plan
 from wlplan.io import write_bytes_atomic
-from wlplan.objective import OBJECTIVES
-from wlplan.planner.job import Job
-from wlplan.plots import png_bytes
-from wlplan.transport import default_receiver
+from wlplan.planning.job import Job
+from wlplan.planning.objective import OBJECTIVES
+from wlplan.planning.transport import default_receiver
+from wlplan.report.figures import png_bytes
+from wlplan.studies.gradcheck import COMPONENTS, TOLERANCE, check_gradient, random_plan
 
 KIND, SLOPE_DEGREES, SEED, LOADS = "conical", 30.0, 1, 5
 

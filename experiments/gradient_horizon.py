@@ -13,16 +13,16 @@ import numpy as np
 
 import wlplan
 from experiments.record import main
-from wlplan.compilation import EachRow
-from wlplan.gradcheck import as_table, cost_and_gradient, differentiable
+from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.io import write_bytes_atomic
-from wlplan.objective import OBJECTIVES
-from wlplan.planner.job import Decisions, Job, ToeJob, outcomes
-from wlplan.planner.toe import toe_of
-from wlplan.plots import png_bytes
-from wlplan.transport import default_receiver
+from wlplan.planning.job import Decisions, Job, ToeJob, outcomes
+from wlplan.planning.objective import OBJECTIVES
+from wlplan.planning.poses import toe_of
+from wlplan.planning.transport import default_receiver
+from wlplan.report.figures import png_bytes
+from wlplan.studies.gradcheck import as_table, cost_and_gradient, differentiable
 from wlplan.types import LoadingPlan
-from wlplan.units import ACTION_HIGH, ACTION_LOW
+from wlplan.xla import EachRow
 
 # A cone that holds twice what 100 loadings take: a bucket that comes back empty from the last of a
 # pile has a large gradient of its own.

@@ -17,9 +17,9 @@ from experiments.record import described, main
 from experiments.trained import SHORT, shipped, trained
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
-from wlplan.published import PERFORMANCE
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.studies.paper import PERFORMANCE
 from wlplan.training import evaluate_performance
 
 SIZES, SEEDS = (100, 300, 1000, 3000), 3

@@ -35,18 +35,18 @@ from experiments.simulator_gradients import (
     site_of_the_line,
 )
 from experiments.trained import PSI, SHIPPED, SHORT, shipped, trained
-from wlplan.characteristics import as_vector, characteristics
+from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
-from wlplan.heightmap import sample_local
 from wlplan.io import write_bytes_atomic
 from wlplan.models.ensemble import Ensemble
 from wlplan.models.performance import PerformanceModel
 from wlplan.models.performance_high import HighPerformanceModel
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, tidy
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, tidy
+from wlplan.terrain.characteristics import as_vector, characteristics
+from wlplan.terrain.heightmap import sample_local
 from wlplan.training.evaluation import sees_map
 from wlplan.types import Pile, Pose
-from wlplan.units import CELL_SIZE
 
 # Parts of a gradient: the poses of the data set lie on the toe, so what the way ahead does has
 # never been seen; a planner moves along the toe and turns.

@@ -18,12 +18,12 @@ from flax import nnx
 from experiments.learning_curve import MODELS
 from experiments.record import described, main
 from experiments.trained import SHORT, trained
-from wlplan.bench.inference import inference_times
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
-from wlplan.published import PERFORMANCE
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.studies.bench.inference import inference_times
+from wlplan.studies.paper import PERFORMANCE
 from wlplan.training import evaluate_performance
 from wlplan.training.evaluation import QUANTITIES
 

@@ -33,16 +33,16 @@ from scipy.spatial import cKDTree
 from experiments.record import described, main
 from experiments.replays import in_batches, surfaces
 from experiments.trained import PSI, SHIPPED, SHORT, shipped, trained
+from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 from wlplan.dataset import LOADS, Dataset, split
-from wlplan.heightmap import PERFORMANCE_CELLS, STATE_CELLS, STATE_DISPLACEMENT
+from wlplan.engines.simulator import dig
 from wlplan.io import write_bytes_atomic
 from wlplan.models.performance import PerformanceModel
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, ORANGE, PALE, new_figure, tidy
-from wlplan.simulator import dig
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, PALE, new_figure, tidy
+from wlplan.terrain.heightmap import PERFORMANCE_CELLS, STATE_CELLS, STATE_DISPLACEMENT
 from wlplan.training.evaluation import predict
 from wlplan.types import Action
-from wlplan.units import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 
 SEED = 11
 CYCLES, REPEATS = 250, 12

@@ -16,9 +16,9 @@ from experiments.record import described, main
 from experiments.trained import PSI, SHORT, trained
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
-from wlplan.published import PERFORMANCE
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.studies.paper import PERFORMANCE
 from wlplan.training import evaluate_performance
 
 # Trainings of each model; of the paper's ψ_high, which takes five minutes, one.

@@ -18,22 +18,18 @@ from jaxtyping import Float
 
 from experiments.record import described, main
 from experiments.trained import SHORT, trained
+from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset, split
-from wlplan.heightmap import STATE_DISPLACEMENT
 from wlplan.io import write_bytes_atomic
 from wlplan.models.pile_state import PileStateModel
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, GREEN, INK, ORANGE, PALE, new_figure, tidy
-from wlplan.published import PILE_STATE
-from wlplan.training import load_model
-from wlplan.training.pile_state import (
-    misplaced_volume,
-    pile_state_errors,
-    predict_pile_state,
-)
+from wlplan.models.storage import load_model
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, GREEN, INK, ORANGE, PALE, new_figure, tidy
+from wlplan.studies.paper import PILE_STATE
+from wlplan.terrain.heightmap import STATE_DISPLACEMENT
+from wlplan.training.pile_state import misplaced_volume, pile_state_errors, predict_pile_state
 from wlplan.types import LocalHeightmap
-from wlplan.units import CELL_SIZE
-from wlplan.worlds import pretrained_path
+from wlplan.worlds.library import pretrained_path
 
 # Trainings of ours; of the paper's, which takes a quarter of an hour, one.
 SEEDS = 5

@@ -13,9 +13,11 @@ import jax
 import wlplan
 from experiments.record import main
 from wlplan.io import write_bytes_atomic
-from wlplan.planner import PLANNERS, GradientSettings, SearchSettings, play
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.planning.plan import PLANNERS, play
+from wlplan.planning.planners.gradient import GradientSettings
+from wlplan.planning.planners.search import SearchSettings
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
 
 KINDS = ("conical", "triangular", "wedge")
 SLOPE_DEGREES, SEED, LOADS = 30.0, 1, 15

@@ -16,10 +16,10 @@ from typing import Any
 
 import jax
 
-from wlplan.compilation import cores
 from wlplan.dataset import Dataset, collect, fingerprint, open_dataset
 from wlplan.errors import InputError
 from wlplan.io import write_text_atomic
+from wlplan.xla import cores
 
 RESULTS = Path(__file__).parent / "results"
 PRESETS = ("full", "smoke")

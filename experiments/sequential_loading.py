@@ -22,18 +22,18 @@ from jaxtyping import Float
 from experiments.error_distribution import STALL
 from experiments.record import described, main
 from experiments.trained import SHORT, trained
+from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
 from wlplan.dataset.protocol import Rollout, choose_pose
+from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic
 from wlplan.models.height_change import HeightChangeModel
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
-from wlplan.published import SEQUENCE, SEQUENCE_LOADS
-from wlplan.simulator import Simulator
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
+from wlplan.studies.paper import SEQUENCE, SEQUENCE_LOADS
 from wlplan.types import Action, Performance, Pile, Pose, World, action_from
-from wlplan.units import CELL_SIZE
-from wlplan.worlds import HighWorld, HybridWorld, LowWorld, load_world
+from wlplan.worlds.library import HighWorld, HybridWorld, LowWorld, load_world
 
 # Another seed than that of the data set: other noise, poses and actions.
 SEED, PILES, LOADS = 1000, 10, 40

@@ -20,13 +20,13 @@ from jaxtyping import Array, Float
 
 import wlplan
 from experiments.record import main
+from wlplan.constants import ACTION_HIGH, ACTION_LOW, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 from wlplan.dataset.protocol import Rollout, choose_pose
+from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig
 from wlplan.io import write_bytes_atomic
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
-from wlplan.simulator import STOP_REASONS, Settings, Simulator, dig
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.types import Pile, Pose, action_from
-from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 
 SEED = 7
 ROLLOUTS, LOADS = 20, 10

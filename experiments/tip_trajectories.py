@@ -17,13 +17,13 @@ from matplotlib.collections import LineCollection
 
 from experiments.record import described, main
 from experiments.replays import in_batches, surfaces
+from wlplan.constants import KG_PER_TONNE
 from wlplan.dataset import Dataset
-from wlplan.heightmap import STATE_CELLS, STATE_DISPLACEMENT, local_axes
+from wlplan.engines.simulator import Trajectory, trace
 from wlplan.io import write_bytes_atomic
-from wlplan.plots import png_bytes
-from wlplan.plots.paper import BLUE, FAINT, ORANGE, new_figure, tidy
-from wlplan.simulator import Trajectory, trace
-from wlplan.units import KG_PER_TONNE
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.terrain.heightmap import STATE_CELLS, STATE_DISPLACEMENT, local_axes
 
 SEED = 0
 # Cycles that are played again, those of them that are drawn, and moments that a path is drawn by.

@@ -18,7 +18,7 @@ from wlplan.dataset import Dataset, fingerprint
 from wlplan.errors import InputError
 from wlplan.io import write_text_atomic
 from wlplan.models.ensemble import Ensemble
-from wlplan.worlds import pretrained_path
+from wlplan.worlds.library import pretrained_path
 
 # Passes over the data with which the paper's ψ_high is trained: 9 s of processor time each.
 CONVOLUTIONAL_EPOCHS = 60

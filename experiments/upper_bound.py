@@ -15,13 +15,13 @@ import numpy as np
 import wlplan
 from experiments.record import main
 from wlplan.io import write_bytes_atomic
-from wlplan.objective import OBJECTIVES
-from wlplan.planner.gradient import GradientSettings, gradient
-from wlplan.planner.job import Decisions, ToeJob, contour_length, outcomes
-from wlplan.planner.search import SearchSettings, greedy
-from wlplan.planner.toe import toe_of
-from wlplan.plots import png_bytes
-from wlplan.transport import default_receiver
+from wlplan.planning.job import Decisions, ToeJob, contour_length, outcomes
+from wlplan.planning.objective import OBJECTIVES
+from wlplan.planning.planners.gradient import GradientSettings, gradient
+from wlplan.planning.planners.search import SearchSettings, greedy
+from wlplan.planning.poses import toe_of
+from wlplan.planning.transport import default_receiver
+from wlplan.report.figures import png_bytes
 
 KIND, SLOPE_DEGREES, SEED, LOADS = "conical", 30.0, 1, 10
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from laws import assert_gradient, assert_volume_kept
 
-from wlplan.automaton import (
+from wlplan.site.machine import WA320
+from wlplan.studies.bench.digs import random_digs
+from wlplan.terrain.automaton import (
     FLOW_FRACTION,
     Schedule,
     converged,
@@ -22,9 +24,7 @@ from wlplan.automaton import (
     sweeps,
     window_of,
 )
-from wlplan.bench.digs import random_digs
-from wlplan.excavation import excavate
-from wlplan.machine import WA320
+from wlplan.terrain.excavation import excavate
 from wlplan.types import Pile, Pose
 
 REPOSE = math.radians(32.0)

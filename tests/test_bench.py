@@ -8,23 +8,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan import bench, cli
-from wlplan.automaton import converged, steepest_slope, sweeps
-from wlplan.bench import automata
-from wlplan.bench.baselines import (
+from wlplan import cli
+from wlplan.errors import InputError
+from wlplan.studies import bench
+from wlplan.studies.bench import automata
+from wlplan.studies.bench.baselines import (
     aeolis_rest,
     numba_sweeps,
     numpy_sweeps,
     rest,
     steepest_rise,
 )
-from wlplan.bench.digs import random_digs
-from wlplan.bench.items import ITEMS
-from wlplan.bench.rollouts import measure_rollouts
-from wlplan.bench.setup import Item, Measured, Setup
-from wlplan.bench.timing import Timing, compiled, timed
-from wlplan.errors import InputError
-from wlplan.pile import volume
+from wlplan.studies.bench.digs import random_digs
+from wlplan.studies.bench.items import ITEMS
+from wlplan.studies.bench.rollouts import measure_rollouts
+from wlplan.studies.bench.setup import Item, Measured, Setup
+from wlplan.studies.bench.timing import Timing, compiled, timed
+from wlplan.terrain.automaton import converged, steepest_slope, sweeps
+from wlplan.terrain.volume import volume
 from wlplan.types import Pile
 
 REPOSE = math.radians(32.0)
@@ -269,7 +270,7 @@ def test_one_item_as_a_file_and_as_json(run, tmp_path):
     assert code == 0
     assert out == (tmp_path / "out" / "bench.json").read_text()
     document = strict_json(out)
-    assert document["format"] == "wlplan.bench/1"
+    assert document["format"] == "wlplan.studies.bench/1"
     assert document["device"]["cores"] >= 1
     assert document["versions"]["jax"] == jax.__version__
     assert [record["name"] for record in document["items"]] == ["psi-low", "gpu-rollouts", "plan"]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from laws import assert_gradient
 
-from wlplan.characteristics import as_vector, characteristics
-from wlplan.heightmap import local_axes
+from wlplan.terrain.characteristics import as_vector, characteristics
+from wlplan.terrain.heightmap import local_axes
 from wlplan.types import LocalHeightmap
 
 

@@ -14,13 +14,20 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from wlplan import cli, dataset, io, objective, planner, plots, report, training, worlds
-from wlplan.diggability import edge_poses
+from wlplan import cli, dataset, io, training
 from wlplan.errors import InputError
-from wlplan.machine import GRAVEL, SAND, WA320
-from wlplan.pile import seed_pile, toe_contour
-from wlplan.planner import PlanResult
+from wlplan.planning import objective
+from wlplan.planning import plan as planner
+from wlplan.planning.plan import PlanResult
+from wlplan.report import figures as plots
+from wlplan.report import page as report
+from wlplan.site.machine import WA320
+from wlplan.site.soil import GRAVEL, SAND
+from wlplan.studies.diggability import edge_poses
+from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.toe import toe_contour
 from wlplan.types import Action, LoadingPlan, Performance, Pose, Rollout
+from wlplan.worlds import library as worlds
 
 FILES = ["plan.json", "plan.png", "report.html", "totals.png"]
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan.compilation import EachRow, cores, kept, stored
+from wlplan.xla import EachRow, cores, kept, stored
 
 
 def shifted(shared, row):

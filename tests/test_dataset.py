@@ -25,7 +25,8 @@ import pytest
 import zarr
 
 from wlplan import cli
-from wlplan.automaton import Schedule
+from wlplan.actions import latin_hypercube
+from wlplan.constants import ACTION_HIGH, ACTION_LOW, CELL_SIZE
 from wlplan.dataset import (
     VARIABLES,
     Dataset,
@@ -45,16 +46,16 @@ from wlplan.dataset import (
 from wlplan.dataset import store as stored
 from wlplan.dataset.protocol import Layout, Rollout, choose_pose
 from wlplan.dataset.worker import simulator_from
+from wlplan.engines.simulator import STOP_REASONS, Simulator
+from wlplan.engines.simulator.cycle import Settings
 from wlplan.errors import InputError
-from wlplan.heightmap import sample_local
-from wlplan.machine import GRAVEL, WA320
 from wlplan.models.normaliser import Normaliser
-from wlplan.pile import SEED_PILES, seed_pile
-from wlplan.sampling import latin_hypercube
-from wlplan.simulator import STOP_REASONS, Simulator
-from wlplan.simulator.cycle import Settings
+from wlplan.site.machine import WA320
+from wlplan.site.soil import GRAVEL
+from wlplan.terrain.automaton import Schedule
+from wlplan.terrain.heightmap import sample_local
+from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
 from wlplan.types import Pile, Pose
-from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE
 
 CYCLES, SEED = 11, 5
 # Three batches.

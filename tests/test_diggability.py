@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan.diggability import PAPER_ACTION, diggability_map, edge_poses
 from wlplan.errors import InputError
-from wlplan.heightmap import sample
-from wlplan.pile import ToeContour, seed_pile, toe_contour
+from wlplan.studies.diggability import PAPER_ACTION, diggability_map, edge_poses
+from wlplan.terrain.heightmap import sample
+from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.toe import ToeContour, toe_contour
 from wlplan.types import Action, Performance, Pose
 
 

@@ -10,24 +10,18 @@ import pytest
 from trainings import check_that_a_killed_one_ends_alike
 
 import wlplan
-from wlplan.automaton import relax
+from wlplan.constants import ACTION_HIGH
 from wlplan.dataset import VARIABLES, Dataset
-from wlplan.diggability import edge_poses
 from wlplan.errors import InputError
 from wlplan.models.ensemble import Ensemble
-from wlplan.pile import seed_pile, toe_contour
-from wlplan.training import (
-    evaluate_performance,
-    fitting,
-    held_out,
-    load_model,
-    read_description,
-    train_psi_high,
-    train_psi_low,
-)
+from wlplan.models.storage import load_model, read_description
+from wlplan.studies.diggability import edge_poses
+from wlplan.terrain.automaton import relax
+from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.toe import toe_contour
+from wlplan.training import evaluate_performance, fitting, held_out, train_psi_high, train_psi_low
 from wlplan.types import LoadingPlan, LocalHeightmap, action_from
-from wlplan.units import ACTION_HIGH
-from wlplan.worlds import HybridWorld, LowWorld
+from wlplan.worlds.library import HybridWorld, LowWorld
 
 MEMBERS = 5
 LIGHT = {"epochs": 30, "batch": 160, "hidden": (128,), "learning_rate": 1e-2, "members": MEMBERS}

@@ -8,19 +8,15 @@ from flax import nnx
 from test_pile_state import model_of
 from test_training import synthetic
 
-from wlplan.bench.inference import BATCH
 from wlplan.cli.evaluated import evaluated, print_times
 from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance import PerformanceModel, PsiLow
 from wlplan.models.pile_state import Phi, PileStateModel
-from wlplan.published import PERFORMANCE, PILE_STATE, SEQUENCE, SEQUENCE_LOADS
-from wlplan.training import (
-    evaluate_performance,
-    evaluate_pile_state,
-    load_model,
-    read_description,
-)
-from wlplan.worlds import pretrained_path
+from wlplan.models.storage import load_model, read_description
+from wlplan.studies.bench.inference import BATCH
+from wlplan.studies.paper import PERFORMANCE, PILE_STATE, SEQUENCE, SEQUENCE_LOADS
+from wlplan.training import evaluate_performance, evaluate_pile_state
+from wlplan.worlds.library import pretrained_path
 
 
 @pytest.fixture(scope="module")

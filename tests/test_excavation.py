@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from laws import assert_gradient
 
-from wlplan.excavation import STRIP_LENGTH, excavate
-from wlplan.heightmap import cell_centres, to_local
+from wlplan.terrain.excavation import STRIP_LENGTH, excavate
+from wlplan.terrain.heightmap import cell_centres, to_local
 from wlplan.types import Pile, Pose
 
 WIDTH = 2.7

@@ -14,7 +14,7 @@ import pytest
 
 import experiments
 from experiments import action_landscape, dataset_overview, record, simulator_gradients
-from wlplan.characteristics import as_vector, characteristics
+from wlplan.terrain.characteristics import as_vector, characteristics
 from wlplan.types import LocalHeightmap
 
 ROOT = Path(__file__).parents[1]

@@ -17,9 +17,9 @@ from experiments import (
 )
 from experiments.trained import trained
 from wlplan import training
+from wlplan.constants import CELL_SIZE
 from wlplan.dataset import fingerprint
 from wlplan.types import Performance
-from wlplan.units import CELL_SIZE
 
 # --- models that are kept
 

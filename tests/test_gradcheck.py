@@ -10,16 +10,19 @@ import numpy as np
 import pytest
 from flax import struct
 
-from wlplan import cli, gradcheck, io, worlds
+from wlplan import cli, io
+from wlplan.constants import ACTION_HIGH
+from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
-from wlplan.gradcheck import COMPONENTS, as_table, check_gradient, plan_from, random_plan
-from wlplan.objective import OBJECTIVES
-from wlplan.pile import seed_pile, toe_contour
-from wlplan.planner.job import Job
-from wlplan.simulator import Simulator
-from wlplan.transport import default_receiver
+from wlplan.planning.job import Job
+from wlplan.planning.objective import OBJECTIVES
+from wlplan.planning.transport import default_receiver
+from wlplan.studies import gradcheck
+from wlplan.studies.gradcheck import COMPONENTS, as_table, check_gradient, plan_from, random_plan
+from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.toe import toe_contour
 from wlplan.types import Performance
-from wlplan.units import ACTION_HIGH
+from wlplan.worlds import library as worlds
 
 
 @jax.custom_vjp
@@ -266,7 +269,7 @@ def test_json_holds_every_component_and_nothing_else(command, tmp_path):
     assert code == 1
     assert out == (tmp_path / "out" / "gradcheck.json").read_text()
     document = json.loads(out)
-    assert document["format"] == "wlplan.gradcheck/1"
+    assert document["format"] == "wlplan.studies.gradcheck/1"
     assert (document["objective"], document["seed"], document["step"]) == ("productivity", 4, 2e-6)
     rows = document["rows"]
     assert [(row["load"], row["component"]) for row in rows] == [

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from laws import assert_gradient
 
-from wlplan.heightmap import (
+from wlplan.terrain.heightmap import (
     add_local_change,
     local_axes,
     sample,

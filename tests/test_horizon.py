@@ -9,13 +9,15 @@ import pytest
 from laws import assert_gradient
 
 import wlplan
-from wlplan.automaton import relax
-from wlplan.horizon import closed_loop, rollout
-from wlplan.machine import GRAVEL
-from wlplan.objective import OBJECTIVES, loading_cost
-from wlplan.pile import evenly_spaced, seed_pile, toe_contour, volume
-from wlplan.simulator import Simulator
-from wlplan.transport import Receiver, transport
+from wlplan.engines.simulator import Simulator
+from wlplan.planning.objective import OBJECTIVES, loading_cost
+from wlplan.planning.rollout import closed_loop, rollout
+from wlplan.planning.transport import Receiver, transport
+from wlplan.site.soil import GRAVEL
+from wlplan.terrain.automaton import relax
+from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.toe import evenly_spaced, toe_contour
+from wlplan.terrain.volume import volume
 from wlplan.types import LoadingPlan, Performance, Pile, Pose, action_from
 
 DENSITY = GRAVEL.density / 1000.0  # [tonne/m^3]

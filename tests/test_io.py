@@ -11,7 +11,9 @@ import pytest
 
 from wlplan import io
 from wlplan.errors import InputError
-from wlplan.pile import seed_pile, toe_contour, volume
+from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.toe import toe_contour
+from wlplan.terrain.volume import volume
 from wlplan.types import Action, LoadingPlan, Performance, Pose
 
 SLOPE = math.radians(30.0)

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan.loading_cycle import SMOOTHING_TIME
-from wlplan.machine import WA320
-from wlplan.simulator import controller, loader
+from wlplan.constants import GRAVITY
+from wlplan.engines.limits import SMOOTHING_TIME
+from wlplan.engines.simulator import controller, loader
+from wlplan.site.machine import WA320
 from wlplan.types import Action
-from wlplan.units import GRAVITY
 
 
 def scalars(*values):

@@ -7,7 +7,7 @@ import pytest
 from laws import assert_gradient
 
 from wlplan.errors import InputError
-from wlplan.objective import OBJECTIVES, Objective, loading_cost, objective_named
+from wlplan.planning.objective import OBJECTIVES, Objective, loading_cost, objective_named
 from wlplan.types import Performance
 
 PLAIN = Objective((2.0, 1.0, 1.0), mass=4.0, time=50.0, work=1000.0)

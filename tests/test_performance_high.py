@@ -7,11 +7,8 @@ import pytest
 from flax import nnx
 from trainings import check_that_a_killed_one_ends_alike
 
-from wlplan.automaton import relax
 from wlplan.dataset import VARIABLES, Dataset
-from wlplan.diggability import edge_poses
 from wlplan.errors import InputError
-from wlplan.machine import GRAVEL
 from wlplan.models.layers import ACTIVATIONS, max_pool, patches, resize
 from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance_high import (
@@ -20,10 +17,15 @@ from wlplan.models.performance_high import (
     PrincipalComponents,
     PsiHigh,
 )
-from wlplan.pile import seed_pile, toe_contour
-from wlplan.training import load_model, read_description, train_psi_high
+from wlplan.models.storage import load_model, read_description
+from wlplan.site.soil import GRAVEL
+from wlplan.studies.diggability import edge_poses
+from wlplan.terrain.automaton import relax
+from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.toe import toe_contour
+from wlplan.training import train_psi_high
 from wlplan.types import LocalHeightmap, action_from
-from wlplan.worlds import load_world
+from wlplan.worlds.library import load_world
 
 LOW = np.array([0.1, 0.0, -0.25, -0.25, 0.0, 0.0, 0.0, 0.0], np.float32)
 HIGH = np.array([0.6, 1.8, 0.4, 0.45, 0.7, 5.0, 0.7, 5.0], np.float32)

@@ -8,17 +8,12 @@ import numpy as np
 import pytest
 
 from wlplan.errors import InputError
-from wlplan.ground import estimate_ground, fill_unseen
-from wlplan.machine import WA320
-from wlplan.pile import (
-    SEED_PILES,
-    evenly_spaced,
-    ground_height,
-    resample,
-    seed_pile,
-    toe_contour,
-    volume,
-)
+from wlplan.site.machine import WA320
+from wlplan.terrain.floor import estimate_ground, fill_unseen
+from wlplan.terrain.resampling import resample
+from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
+from wlplan.terrain.toe import evenly_spaced, toe_contour
+from wlplan.terrain.volume import volume
 from wlplan.types import Pile
 
 CELL = 0.1
@@ -65,7 +60,7 @@ def test_volume_of_a_cone():
 def test_volume_counts_from_the_ground():
     height = np.full((50, 60), 2.0)
     assert volume(pile_of(height, ground=height - 0.5)) == pytest.approx(0.5 * 50 * 60 * 0.01)
-    assert not ground_height(pile_of(height)).any()
+    assert not pile_of(height).floor.any()
 
 
 def test_volume_under_jit_and_vmap_equals_one_by_one():

@@ -6,27 +6,22 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from wlplan.automaton import relax
-from wlplan.automaton.slopes import steepest_slope
 from wlplan.dataset import VARIABLES, Dataset
-from wlplan.diggability import edge_poses
 from wlplan.errors import InputError
-from wlplan.machine import GRAVEL
 from wlplan.models.height_change import HeightChange, HeightChangeModel, Patterns, project
 from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance_high import HighPerformanceModel, PsiHigh
-from wlplan.models.pile_state import (
-    Phi,
-    PileStateModel,
-    _gathered,
-    _scattered,
-    blended,
-    scaled,
-)
-from wlplan.pile import seed_pile, toe_contour
-from wlplan.training import evaluate_pile_state, load_model, train_phi, train_phi_vae
+from wlplan.models.pile_state import Phi, PileStateModel, _gathered, _scattered, blended, scaled
+from wlplan.models.storage import load_model
+from wlplan.site.soil import GRAVEL
+from wlplan.studies.diggability import edge_poses
+from wlplan.terrain.automaton import relax
+from wlplan.terrain.automaton.slopes import steepest_slope
+from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.toe import toe_contour
+from wlplan.training import evaluate_pile_state, train_phi, train_phi_vae
 from wlplan.types import LocalHeightmap, action_from
-from wlplan.worlds import HighWorld
+from wlplan.worlds.library import HighWorld
 
 ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
 

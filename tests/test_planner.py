@@ -11,11 +11,13 @@ from laws import assert_gradient
 
 import wlplan
 from wlplan.errors import InputError
-from wlplan.excavation import excavate
-from wlplan.pile import ToeContour, toe_contour
-from wlplan.planner import GradientSettings, SearchSettings, plan_loads, play
-from wlplan.planner.job import squash, unsquash
-from wlplan.planner.toe import TOE_RISE, distance_to_toe, pose_at, toe_of
+from wlplan.planning.job import squash, unsquash
+from wlplan.planning.plan import plan_loads, play
+from wlplan.planning.planners.gradient import GradientSettings
+from wlplan.planning.planners.search import SearchSettings
+from wlplan.planning.poses import TOE_RISE, distance_to_toe, pose_at, toe_of
+from wlplan.terrain.excavation import excavate
+from wlplan.terrain.toe import ToeContour, toe_contour
 from wlplan.types import Action, Performance, Pile, Pose, action_vector
 
 BEST_ACTION = np.array([0.3, 2.0, 0.5, 3.5])

@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan import plots
-from wlplan.diggability import DiggabilityMap, edge_poses
 from wlplan.errors import InputError
-from wlplan.pile import seed_pile, toe_contour
-from wlplan.plots.digs import _first_crossing, _on_pile, label_places
-from wlplan.plots.relief import _relief
-from wlplan.transport import Receiver
+from wlplan.planning.transport import Receiver
+from wlplan.report import figures as plots
+from wlplan.report.figures.digs import _first_crossing, _on_pile, label_places
+from wlplan.report.figures.relief import _relief
+from wlplan.studies.diggability import DiggabilityMap, edge_poses
+from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.toe import toe_contour
 from wlplan.types import Action, LoadingPlan, Performance, Pose
 
 

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import pytest
 
 import wlplan
-from wlplan import presets
+from wlplan.constants import CELL_SIZE
+from wlplan.engines.simulator.cycle import Settings, dig
 from wlplan.errors import InputError
-from wlplan.heightmap import STATE_CELLS, STATE_DISPLACEMENT
-from wlplan.machine import CLAY, GRAVEL, SAND, WA320, Soil, WheelLoader
-from wlplan.presets import (
-    MACHINES,
-    SOILS,
+from wlplan.site import parameters, presets
+from wlplan.site.machine import MACHINES, WA320, WheelLoader
+from wlplan.site.parameters import ranges_of
+from wlplan.site.presets import (
     check_machine,
     check_soil,
     machine_named,
@@ -23,9 +23,9 @@ from wlplan.presets import (
     soil_named,
     soil_recorded,
 )
-from wlplan.simulator.cycle import Settings, dig
+from wlplan.site.soil import CLAY, GRAVEL, SAND, SOILS, Soil
+from wlplan.terrain.heightmap import STATE_CELLS, STATE_DISPLACEMENT
 from wlplan.types import Action
-from wlplan.units import CELL_SIZE
 
 FITTED = (
     *("fill_factor", "edge_resistance", "content_push", "content_carry"),
@@ -88,14 +88,14 @@ def test_the_presets_that_are_asked_for():
 
 
 def test_every_field_has_its_range_and_the_map_its_size():
-    assert list(presets._SOIL_RANGES) == SOIL_FIELDS
-    assert list(presets._MACHINE_RANGES) == MACHINE_FIELDS
-    assert pytest.approx(STATE_CELLS * CELL_SIZE) == presets.MAP_WIDTH
-    assert presets.MAP_BEHIND == STATE_DISPLACEMENT
+    assert list(ranges_of(Soil)) == SOIL_FIELDS
+    assert list(ranges_of(WheelLoader)) == MACHINE_FIELDS
+    assert pytest.approx(STATE_CELLS * CELL_SIZE) == parameters.MAP_WIDTH
+    assert parameters.MAP_BEHIND == STATE_DISPLACEMENT
     assert Settings().step == presets._LONGEST_STEP
     for ranges, angles in (
-        (presets._SOIL_RANGES, ANGLES),
-        (presets._MACHINE_RANGES, MACHINE_ANGLES),
+        (ranges_of(Soil), ANGLES),
+        (ranges_of(WheelLoader), MACHINE_ANGLES),
     ):
         assert [name for name, allowed in ranges.items() if allowed.is_angular] == list(angles)
 
@@ -297,7 +297,7 @@ def test_a_narrower_bucket_loads_less(loaded):
 
 
 def test_the_widest_bucket_that_is_let_pass_digs(loaded):
-    widest = dataclasses.replace(WA320, bucket_width=presets.MAP_WIDTH)
+    widest = dataclasses.replace(WA320, bucket_width=parameters.MAP_WIDTH)
     assert 0.0 < loaded(machine=widest) < 2.0 * loaded()
 
 

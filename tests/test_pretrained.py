@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from wlplan import cli
-from wlplan.automaton import relax
 from wlplan.dataset import VARIABLES, Dataset, differences, probes, probes_of
-from wlplan.diggability import edge_poses
 from wlplan.errors import InputError
-from wlplan.pile import SEED_PILES, seed_pile, toe_contour
-from wlplan.training import load_model, read_description, train_all, weights
+from wlplan.models.storage import load_model, read_description
+from wlplan.studies.diggability import edge_poses
+from wlplan.terrain.automaton import relax
+from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
+from wlplan.terrain.toe import toe_contour
+from wlplan.training import train_all, weights
 from wlplan.types import action_from
-from wlplan.worlds import MODELS, load_world, pretrained_path
+from wlplan.worlds.library import MODELS, load_world, pretrained_path
 
 SHIPPED = sorted({kind for kinds in MODELS.values() for kind in kinds})
 REBUILD = "make them again: `make weights`, or `wlplan train all --data DATA.zarr --out DIR`"

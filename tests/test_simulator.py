@@ -11,14 +11,16 @@ import pytest
 from scipy import ndimage, stats
 
 from experiments.dem_reference import REFERENCE, replay
-from wlplan.automaton import FLOW_FRACTION, relax, steepest_slope, sweep
-from wlplan.heightmap import local_axes
-from wlplan.machine import GRAVEL, WA320
-from wlplan.pile import SEED_PILES, seed_pile, toe_contour
-from wlplan.simulator import STOP_REASONS, Settings, Simulator, dig, terrain
-from wlplan.simulator.cycle import advance, begin, outcome
+from wlplan.constants import ACTION_HIGH, GRAVITY
+from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig, terrain
+from wlplan.engines.simulator.cycle import advance, begin, outcome
+from wlplan.site.machine import WA320
+from wlplan.site.soil import GRAVEL
+from wlplan.terrain.automaton import FLOW_FRACTION, relax, steepest_slope, sweep
+from wlplan.terrain.heightmap import local_axes
+from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
+from wlplan.terrain.toe import toe_contour
 from wlplan.types import Pile, Pose, action_from
-from wlplan.units import ACTION_HIGH, GRAVITY
 
 ALONG, LEFT = local_axes(52, 1.0)
 GRID = 224  # cells a side that hold any seed pile

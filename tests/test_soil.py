@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from laws import assert_gradient
 
-from wlplan.machine import GRAVEL, Soil
-from wlplan.simulator.soil import earthmoving_force
-from wlplan.units import GRAVITY
+from wlplan.constants import GRAVITY
+from wlplan.engines.simulator.soil import earthmoving_force
+from wlplan.site.soil import GRAVEL, Soil
 
 # Design, section 5: rake 60, external friction 20, internal friction 35 degrees, flat ground.
 ORACLE = Soil(density=1800.0, friction=math.radians(35.0), steel_friction=math.radians(20.0))

@@ -11,22 +11,20 @@ import optax
 import pytest
 from flax import nnx
 
+from wlplan.constants import ACTION_HIGH
 from wlplan.dataset import VARIABLES, Dataset, split
 from wlplan.errors import InputError
+from wlplan.models import storage
 from wlplan.models.performance import PsiLow
+from wlplan.models.storage import load_model, read_description, save_model
 from wlplan.training import (
     LOSSES,
     evaluate_performance,
     fitting,
     held_out,
-    load_model,
-    read_description,
-    save_model,
     shares_piles,
-    storage,
     train_psi_low,
 )
-from wlplan.units import ACTION_HIGH
 
 LIGHT = {"epochs": 40, "batch": 64, "hidden": (32, 32), "dropout": 0.0, "learning_rate": 1e-2}
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan.heightmap import local_axes
-from wlplan.machine import WA320
-from wlplan.simulator import STOP_REASONS, Settings, dig, trace
+from wlplan.engines.simulator import STOP_REASONS, Settings, dig, trace
+from wlplan.site.machine import WA320
+from wlplan.terrain.heightmap import local_axes
 from wlplan.types import action_from
 
 ALONG, _ = local_axes(52, 1.0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from laws import assert_gradient
 
-from wlplan.machine import WA320
-from wlplan.transport import (
+from wlplan.constants import GRAVITY
+from wlplan.planning.transport import (
     DUMP_TIME,
     SHIFT_TIME,
     TURNING_RADIUS,
@@ -18,8 +18,8 @@ from wlplan.transport import (
     transport,
     v_turn_length,
 )
+from wlplan.site.machine import WA320
 from wlplan.types import Pile, Pose
-from wlplan.units import GRAVITY
 
 # The follow-up's receiver for a pile whose toe is at the origin.
 FOLLOW_UP = (-12.0, -3.0, math.radians(-30.0))

@@ -8,15 +8,26 @@ the paper. Array leaves are batched by `jax.vmap`; nothing in here does arithmet
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, no_type_check
+from typing import TYPE_CHECKING, Any, no_type_check
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 # JAX rebuilds pytrees with tracers, shapes or None inside, so these classes opt out of runtime
 # shape checking; the functions that take them are checked.
+#
+# Users write arrays as numpy, lists or Python numbers: type checkers see constructors that take
+# all of them, and `_as_arrays` makes arrays of what a pytree would take apart.
+
+
+def _as_arrays(node: Any, *names: str) -> None:
+    """Turns numpy arrays, lists and tuples among fields into arrays; leaves all else untouched."""
+    for name in names:
+        value = getattr(node, name)
+        if isinstance(value, np.ndarray | list | tuple):
+            object.__setattr__(node, name, jnp.asarray(value))
 
 
 @no_type_check
@@ -28,20 +39,32 @@ class Pile(struct.PyTreeNode):
 
     height: Float[Array, "*batch nx ny"]  # surface [m]
     cell_size: float = struct.field(pytree_node=False)  # grid spacing [m]
-    origin: Float[Array, "*batch 2"] | tuple[float, float] = (0.0, 0.0)  # centre of cell [0, 0] [m]
-    ground: Float[Array, "*batch nx ny"] | None = None  # floor under the pile [m]; None: level 0
+    origin: Float[Array, "*batch 2"] = (0.0, 0.0)  # type: ignore[assignment]  # cell [0, 0] [m]
+    ground: Float[Array, "*batch nx ny"] | None = None  # what cannot be moved [m]; None: level 0
     valid: Bool[Array, "*batch nx ny"] | None = None  # cells the scan saw; None: all of them
 
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            height: ArrayLike | list[Any],
+            cell_size: float,
+            origin: ArrayLike | list[float] | tuple[float, float] = (0.0, 0.0),
+            ground: ArrayLike | list[Any] | None = None,
+            valid: ArrayLike | list[Any] | None = None,
+        ) -> None: ...
+
     def __post_init__(self):
-        # Users write plain tuples and lists; tracers and placeholders pass through untouched.
         if isinstance(self.origin, tuple | list) and all(
             isinstance(value, int | float | np.number) for value in self.origin
         ):
             object.__setattr__(self, "origin", jnp.asarray(self.origin, dtype=float))
-        for name in ("height", "ground", "valid"):
-            value = getattr(self, name)
-            if isinstance(value, np.ndarray | list):
-                object.__setattr__(self, name, jnp.asarray(value))
+        _as_arrays(self, "height", "origin", "ground", "valid")
+
+    @property
+    def floor(self) -> Float[Array, "*batch nx ny"]:
+        """What cannot be moved: floor under the pile [m]; level 0 where there is no ground map."""
+        return jnp.zeros_like(self.height) if self.ground is None else self.ground
 
 
 @no_type_check
@@ -52,6 +75,18 @@ class Pose(struct.PyTreeNode):
     y: Float[Array, "*batch"]  # [m]
     heading: Float[Array, "*batch"]  # [rad], counter-clockwise from +x
 
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            x: ArrayLike | list[Any],
+            y: ArrayLike | list[Any],
+            heading: ArrayLike | list[Any],
+        ) -> None: ...
+
+    def __post_init__(self):
+        _as_arrays(self, "x", "y", "heading")
+
 
 @no_type_check
 class Action(struct.PyTreeNode):
@@ -61,6 +96,19 @@ class Action(struct.PyTreeNode):
     k_bm: Float[Array, "*batch"]  # boom velocity gain [1], 0..5
     delta_bk: Float[Array, "*batch"]  # bucket force threshold [1], 0..0.7
     k_bk: Float[Array, "*batch"]  # bucket velocity gain [1], 0..5
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            delta_bm: ArrayLike | list[Any],
+            k_bm: ArrayLike | list[Any],
+            delta_bk: ArrayLike | list[Any],
+            k_bk: ArrayLike | list[Any],
+        ) -> None: ...
+
+    def __post_init__(self):
+        _as_arrays(self, "delta_bm", "k_bm", "delta_bk", "k_bk")
 
 
 def action_vector(action: Action) -> Float[Array, "*batch 4"]:
@@ -80,6 +128,18 @@ class Performance(struct.PyTreeNode):
     mass: Float[Array, "*batch"]  # [tonne]
     time: Float[Array, "*batch"]  # [s]
     work: Float[Array, "*batch"]  # [kJ]
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            mass: ArrayLike | list[Any],
+            time: ArrayLike | list[Any],
+            work: ArrayLike | list[Any],
+        ) -> None: ...
+
+    def __post_init__(self):
+        _as_arrays(self, "mass", "time", "work")
 
 
 @no_type_check

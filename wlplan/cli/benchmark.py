@@ -11,7 +11,7 @@ from wlplan.cli.options import out_option, with_options
 from wlplan.cli.outputs import checked_folder, json_text, print_table, titled_table, write_files
 from wlplan.cli.progress import Progress
 
-# Names that `wlplan.bench` defines, repeated here to keep help fast; a test compares them.
+# Names that `wlplan.studies.bench` defines, repeated here to keep help fast; a test compares them.
 ITEMS = (
     *("avalanche", "avalanche-gradient", "avalanche-batch", "loading", "rollout"),
     *("rollout-gradient", "psi-low", "psi-low-batch", "gpu-rollouts", "cycles", "plan"),
@@ -53,7 +53,7 @@ def bench(names: tuple[str, ...], quick: bool, out: str | None, seed: int, as_js
     """
     folder = None if out is None else checked_folder(out)
 
-    from wlplan.bench import run_bench
+    from wlplan.studies.bench import run_bench
 
     with Progress() as progress:
         document = run_bench(names, quick=quick, seed=seed, progress=progress)

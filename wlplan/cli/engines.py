@@ -9,10 +9,10 @@ from wlplan.cli.outputs import remark
 from wlplan.cli.progress import ready
 
 if TYPE_CHECKING:
-    from wlplan.dem.cycle import Played
-    from wlplan.dem.world import DiscreteElements
-    from wlplan.planner import PlanResult
-    from wlplan.transport import Receiver
+    from wlplan.engines.dem.cycle import Played
+    from wlplan.engines.dem.world import DiscreteElements
+    from wlplan.planning.plan import PlanResult
+    from wlplan.planning.transport import Receiver
     from wlplan.types import LoadingPlan, Pile, World
 
 
@@ -38,8 +38,8 @@ def play_in(
     Returns:
         What came of it, and what plan.json says of each cycle besides; None for the simulator.
     """
-    from wlplan.dem.world import DiscreteElements
-    from wlplan.planner import play
+    from wlplan.engines.dem.world import DiscreteElements
+    from wlplan.planning.plan import play
 
     if isinstance(world, DiscreteElements):
         return _load_by_load(
@@ -63,9 +63,9 @@ def _load_by_load(
     import jax
     import jax.numpy as jnp
 
-    from wlplan.dem.process import cache_folder
-    from wlplan.dem.world import loads, site_remark
-    from wlplan.planner import judge
+    from wlplan.engines.dem.process import cache_folder
+    from wlplan.engines.dem.world import loads, site_remark
+    from wlplan.planning.plan import judge
     from wlplan.types import Rollout
 
     unfit = site_remark(world.soil)
@@ -91,7 +91,7 @@ def _load_by_load(
 
 def _fields(played: Played) -> dict[str, Any]:
     """What plan.json says of a cycle: SI units, but for the work of the wheels' slip [kJ]."""
-    from wlplan.units import J_PER_KJ
+    from wlplan.constants import J_PER_KJ
 
     return {
         "stop_reason": played.stop_reason,

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from wlplan.cli.outputs import QUANTITIES, print_table, titled_table
-from wlplan.published import PERFORMANCE, PILE_STATE
+from wlplan.studies.paper import PERFORMANCE, PILE_STATE
 
 
 def evaluated(model: Any, part: Any, description: Mapping[str, Any]) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def evaluated(model: Any, part: Any, description: Mapping[str, Any]) -> dict[str
         part: Data set of the cycles that it is compared with.
         description: Description of the model, see `wlplan.training.read_description`.
     """
-    from wlplan.bench.inference import inference_times
+    from wlplan.studies.bench.inference import inference_times
     from wlplan.training import evaluate_performance, evaluate_pile_state
 
     kind = description["kind"]

@@ -31,7 +31,7 @@ from wlplan.cli.progress import Progress, Stopwatch
 from wlplan.errors import InputError
 
 if TYPE_CHECKING:
-    from wlplan.gradcheck import GradientCheck
+    from wlplan.studies.gradcheck import GradientCheck
 
 _FORMAT = "wlplan.gradcheck/1"
 # Every component costs two rollouts, and in the simulator, with its fixed number of steps, a
@@ -100,10 +100,10 @@ def gradcheck(
         )
     folder = None if out is None else checked_folder(out)
 
-    from wlplan.gradcheck import SIMULATOR_TOLERANCE, TOLERANCE, check_gradient, random_plan
     from wlplan.io import plan_to_dict
-    from wlplan.objective import objective_named
-    from wlplan.planner.job import Job
+    from wlplan.planning.job import Job
+    from wlplan.planning.objective import objective_named
+    from wlplan.studies.gradcheck import SIMULATOR_TOLERANCE, TOLERANCE, check_gradient, random_plan
 
     if tolerance is None:
         tolerance = SIMULATOR_TOLERANCE if in_simulator else TOLERANCE

@@ -13,20 +13,14 @@ from typing import TYPE_CHECKING, Any
 from wlplan.cli.options import BUNDLED
 from wlplan.cli.outputs import remark
 from wlplan.errors import InputError
-from wlplan.machine import GRAVEL, WA320, Soil, WheelLoader
-from wlplan.presets import (
-    MACHINES,
-    SOILS,
-    machine_named,
-    machine_recorded,
-    soil_named,
-    soil_recorded,
-)
+from wlplan.site.machine import MACHINES, WA320, WheelLoader
+from wlplan.site.presets import machine_named, machine_recorded, soil_named, soil_recorded
+from wlplan.site.soil import GRAVEL, SOILS, Soil
 
 if TYPE_CHECKING:
     from jaxtyping import Array
 
-    from wlplan.transport import Receiver
+    from wlplan.planning.transport import Receiver
     from wlplan.types import Pile, World
 
 # Endings of the files that `wlplan.io` reads, repeated to keep help fast; a test compares them.
@@ -124,7 +118,7 @@ def pile_named(name: str) -> tuple[Pile, dict[str, Any]]:
         InputError: If it cannot be read or dug.
     """
     from wlplan.io import bundled_pile_path, read_pile
-    from wlplan.pile import toe_contour
+    from wlplan.terrain.toe import toe_contour
 
     path = bundled_pile_path() if name == BUNDLED else Path(name)
     pile = read_pile(path)
@@ -203,7 +197,7 @@ def world_named(
         model: Folder of a ψ in place of the one that ships with the package.
         pile_state: Folder of a φ likewise, for the high world.
     """
-    from wlplan.worlds import MODELS, load_world
+    from wlplan.worlds.library import MODELS, load_world
 
     # Only the high world asks for it.
     second = {} if pile_state is None else {"pile_state": pile_state}
@@ -216,8 +210,8 @@ def world_named(
 
 def _remark_on_training(kind: str, model: str | None, site: Site) -> bool:
     """Tell if a model was trained for another soil or machine than those of a site."""
-    from wlplan.training import read_description
-    from wlplan.worlds import pretrained_path
+    from wlplan.models.storage import read_description
+    from wlplan.worlds.library import pretrained_path
 
     folder = pretrained_path(kind) if model is None else Path(model)
     data = read_description(folder, None).get("dataset")
@@ -269,9 +263,8 @@ def receiver_at(pile: Pile, truck: tuple[float, ...] | None) -> Receiver:
     import jax.numpy as jnp
     import numpy as np
 
-    from wlplan.heightmap import sample
-    from wlplan.pile import ground_height
-    from wlplan.transport import Receiver, default_receiver
+    from wlplan.planning.transport import Receiver, default_receiver
+    from wlplan.terrain.heightmap import sample
 
     if truck is None:
         return default_receiver(pile)
@@ -286,7 +279,7 @@ def receiver_at(pile: Pile, truck: tuple[float, ...] | None) -> Receiver:
             f"m: give it in that frame (whole kilometres of survey coordinates are taken off)."
         )
     dtype = pile.height.dtype
-    above = pile.height - ground_height(pile)
+    above = pile.height - pile.floor
     place = [jnp.asarray(value, dtype) for value in (x, y)]
     inside = bool(np.all((np.array([x, y]) >= low) & (np.array([x, y]) <= low + size)))
     if inside and float(sample(above, pile, *place)) > 0.5:
@@ -304,9 +297,9 @@ def _heading_of_shortest_ways(pile: Pile, place: Sequence[Array]) -> float:
     import jax.numpy as jnp
     import numpy as np
 
-    from wlplan.diggability import edge_poses
-    from wlplan.pile import toe_contour
-    from wlplan.transport import Receiver, v_turn_length
+    from wlplan.planning.transport import Receiver, v_turn_length
+    from wlplan.studies.diggability import edge_poses
+    from wlplan.terrain.toe import toe_contour
 
     dtype = pile.height.dtype
     poses = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), edge_poses(toe_contour(pile), 24))

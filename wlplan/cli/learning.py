@@ -87,7 +87,7 @@ def collect(
     site = site_named(soil, machine)
 
     from wlplan.dataset import collect as collect_cycles
-    from wlplan.simulator import Simulator
+    from wlplan.engines.simulator import Simulator
 
     begin = time.perf_counter()
     counts: list[tuple[int, float]] = []
@@ -343,8 +343,9 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
         check_is_folder(model, "model", "wlplan train")
 
     from wlplan.dataset import open_dataset
-    from wlplan.training import held_out, load_model, read_description, shares_piles
-    from wlplan.worlds import pretrained_path
+    from wlplan.models.storage import load_model, read_description
+    from wlplan.training import held_out, shares_piles
+    from wlplan.worlds.library import pretrained_path
 
     folder = pretrained_path("psi_low") if model is None else Path(model)
     description = read_description(folder, kind=None)

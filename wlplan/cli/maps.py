@@ -84,12 +84,12 @@ def diggability(
 
     import numpy as np
 
-    from wlplan.diggability import diggability_map
+    from wlplan.studies.diggability import diggability_map
     from wlplan.types import Action
 
     pile, source = pile_named(pile_file)
     world = world_named(world_name, site, model, pile_state)
-    fixed = Action(*action)  # type: ignore[arg-type]
+    fixed = Action(*action)
     with Progress() as progress, Stopwatch() as mapping:
         progress("diggability", 0, 1, None)
         found = ready(diggability_map(world, pile, locations=locations, action=fixed))
@@ -123,7 +123,7 @@ def diggability(
     }
     text = json_text(document)
     if folder is not None:
-        from wlplan import plots
+        from wlplan.report import figures as plots
 
         png = plots.png_bytes(plots.diggability_figure(pile, found))
         write_files(folder, {"diggability.png": png, "diggability.json": f"{text}\n"})

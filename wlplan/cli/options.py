@@ -9,8 +9,9 @@ from typing import Any
 
 import click
 
-from wlplan.presets import MACHINES, SOILS
-from wlplan.units import ACTION_HIGH, ACTION_LOW
+from wlplan.constants import ACTION_HIGH, ACTION_LOW
+from wlplan.site.machine import MACHINES
+from wlplan.site.soil import SOILS
 
 # Names that the modules behind define, repeated here to keep help fast; a test compares them.
 WORLDS = ("low", "high", "hybrid", "simulator")

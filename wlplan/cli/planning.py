@@ -41,8 +41,8 @@ from wlplan.cli.played import ledger_of, print_plan, remark_on_ledger, totals, t
 from wlplan.cli.progress import Progress, Stopwatch, ready
 
 if TYPE_CHECKING:
-    from wlplan.planner import PlanResult
-    from wlplan.transport import Receiver
+    from wlplan.planning.plan import PlanResult
+    from wlplan.planning.transport import Receiver
     from wlplan.types import Performance, Pile
 
 _MOST_LOADS = 500
@@ -96,7 +96,7 @@ def plan(
     folder = None if out is None else checked_folder(out)
 
     from wlplan.io import plan_to_dict
-    from wlplan.planner import plan_loads
+    from wlplan.planning.plan import plan_loads
 
     pile, source = pile_named(pile_file)
     receiver = receiver_at(pile, truck)
@@ -182,9 +182,9 @@ def _write_plan(
     receiver: Receiver,
     seconds: Mapping[str, str],
 ) -> None:
-    from wlplan import plots
     from wlplan.io import write_bytes_atomic, write_plan
-    from wlplan.report import write_report
+    from wlplan.report import figures as plots
+    from wlplan.report.page import write_report
 
     count = len(document["loads"])
     map_png = plots.png_bytes(

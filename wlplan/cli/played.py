@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from wlplan.cli.outputs import QUANTITIES, print_table, remark, titled_table
 
 if TYPE_CHECKING:
-    from wlplan.planner import PlanResult
+    from wlplan.planning.plan import PlanResult
     from wlplan.types import Performance, Pile
 
 
@@ -34,12 +34,11 @@ def ledger_of(pile: Pile, simulated: PlanResult, simulator: Any) -> dict[str, fl
     """What left the pile [m^3], and what was loaded [tonne], at a density [tonne/m^3]."""
     import numpy as np
 
-    from wlplan.pile import ground_height
-    from wlplan.units import KG_PER_TONNE
+    from wlplan.constants import KG_PER_TONNE
 
     def volume(after: Pile) -> float:
         # In float64: a bucket is a small difference of large volumes.
-        above = np.asarray(after.height, np.float64) - np.asarray(ground_height(after), np.float64)
+        above = np.asarray(after.height, np.float64) - np.asarray(after.floor, np.float64)
         return float(above.sum()) * after.cell_size**2
 
     return {
@@ -52,7 +51,7 @@ def ledger_of(pile: Pile, simulated: PlanResult, simulator: Any) -> dict[str, fl
 
 def remark_on_ledger(ledger: Mapping[str, float]) -> None:
     """Tell if volume and mass of a ledger do not agree."""
-    from wlplan.report import LEDGER_TOLERANCE, ledger_error
+    from wlplan.report.page import LEDGER_TOLERANCE, ledger_error
 
     error = ledger_error(ledger)
     if error > LEDGER_TOLERANCE:

@@ -16,7 +16,7 @@ from wlplan.dataset.collecting import collect
 from wlplan.dataset.merging import merge
 from wlplan.dataset.probes import differences, probes_of
 from wlplan.dataset.protocol import PROTOCOLS
-from wlplan.dataset.store import DATASET_FORMAT, open_dataset, versions
+from wlplan.dataset.store import DATASET_FORMAT, open_dataset
 from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, fingerprint, join, reflect, split
 
 __all__ = [
@@ -34,5 +34,4 @@ __all__ = [
     "probes_of",
     "reflect",
     "split",
-    "versions",
 ]

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from wlplan.compilation import cores
 from wlplan.dataset.crew import Played, Session, Worker, hired
 from wlplan.dataset.protocol import Layout
 from wlplan.dataset.variables import LOADS, VARIABLES
+from wlplan.xla import cores
 
 
 def batches_of(

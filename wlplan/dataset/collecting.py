@@ -13,8 +13,8 @@ from wlplan.dataset.batches import batches_of
 from wlplan.dataset.crew import Session
 from wlplan.dataset.protocol import PROTOCOLS, Layout
 from wlplan.dataset.variables import LOADS
+from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
-from wlplan.simulator import Simulator
 
 _SIMULATOR = Simulator()
 

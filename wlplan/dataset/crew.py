@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import wlplan
+from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
-from wlplan.simulator import Simulator
 
 # What makes XLA use one core in a process, and the processor whatever else there is.
 _ENVIRONMENT = {"NPROC": "1", "JAX_PLATFORMS": "cpu"}

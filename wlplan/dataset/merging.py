@@ -14,6 +14,7 @@ from wlplan.dataset import store
 from wlplan.dataset.protocol import Layout
 from wlplan.dataset.variables import VARIABLES
 from wlplan.errors import InputError
+from wlplan.io.provenance import command
 
 # Attributes that are a shard's own; in all others the shards of a data set agree.
 _OWN = ("shard", "first_cycle", "cycles", "cycles_done", "command")
@@ -62,7 +63,7 @@ def merge(
         _check_chunks(shard.path, shard.layout)
     whole = Layout(shards[0].layout.cycles)
     attributes = {k: v for k, v in shards[0].attributes.items() if k not in store.SHARD_ATTRIBUTES}
-    attributes |= {"cycles": whole.cycles, "command": store.command(), "cycles_done": 0}
+    attributes |= {"cycles": whole.cycles, "command": command(), "cycles_done": 0}
     complete = {"cycles_done": whole.cycles}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)  # the lock goes there

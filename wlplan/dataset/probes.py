@@ -20,14 +20,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from wlplan.characteristics import as_vector, characteristics
+from wlplan.constants import CELL_SIZE
 from wlplan.dataset.protocol import Rollout, grid_origin
 from wlplan.dataset.variables import Dataset
-from wlplan.heightmap import STATE_CELLS, STATE_DISPLACEMENT, local_points, sample, sample_local
-from wlplan.pile import SEED_PILES
-from wlplan.simulator import Simulator
+from wlplan.engines.simulator import Simulator
+from wlplan.terrain.characteristics import as_vector, characteristics
+from wlplan.terrain.heightmap import (
+    STATE_CELLS,
+    STATE_DISPLACEMENT,
+    local_points,
+    sample,
+    sample_local,
+)
+from wlplan.terrain.seed_piles import SEED_PILES
 from wlplan.types import Pile, Pose, action_from
-from wlplan.units import CELL_SIZE
 
 # Loadings of each rollout.
 _LOADS = 5

@@ -13,14 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wlplan.automaton import relax
+from wlplan.actions import latin_hypercube
+from wlplan.constants import ACTION_HIGH, ACTION_LOW, CELL_SIZE
 from wlplan.dataset.variables import LOADS, VARIABLES, h36_after
+from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
-from wlplan.pile import SEED_PILES, seed_pile, toe_contour
-from wlplan.sampling import latin_hypercube
-from wlplan.simulator import Simulator
+from wlplan.terrain.automaton import relax
+from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
+from wlplan.terrain.toe import toe_contour
 from wlplan.types import Pile
-from wlplan.units import ACTION_HIGH, ACTION_LOW, CELL_SIZE
 
 # Rollouts that are written as one batch: one chunk of every variable, 19 MB of the largest.
 _BATCH = 60

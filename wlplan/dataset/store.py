@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib.metadata
 import itertools
 import json
 import os
-import shlex
 import shutil
 import socket
-import sys
 import time
 import warnings
 from collections.abc import Iterator, Mapping
@@ -22,8 +19,9 @@ import numpy as np
 
 from wlplan.dataset.protocol import Layout
 from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, h36_after
+from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
-from wlplan.simulator import Simulator
+from wlplan.io.provenance import command, versions
 
 DATASET_FORMAT = "wlplan.dataset/1"
 
@@ -221,19 +219,6 @@ def update_attributes(path: Path, changes: Mapping[str, Any]) -> None:
         file.flush()
         os.fsync(file.fileno())
     os.replace(beside, target)
-
-
-def command() -> str:
-    """The words that this process was started with."""
-    spec = getattr(sys.modules["__main__"], "__spec__", None)
-    # Run by `python -m`, a module has a name, and a package is named by its `__main__`.
-    module = [] if spec is None else ["python", "-m", spec.name.removesuffix(".__main__")]
-    return shlex.join([*(module or [Path(sys.argv[0]).name]), *sys.argv[1:]])
-
-
-def versions() -> dict[str, str]:
-    """Versions of the packages that decide the numbers."""
-    return {name: importlib.metadata.version(name) for name in ("wlplan", "jax", "numpy")}
 
 
 @contextlib.contextmanager

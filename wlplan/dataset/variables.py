@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from wlplan.constants import CELL_SIZE
+from wlplan.engines.simulator import STOP_REASONS
 from wlplan.errors import InputError
-from wlplan.heightmap import (
+from wlplan.terrain.heightmap import (
     PERFORMANCE_CELLS,
     PERFORMANCE_DISPLACEMENT,
     STATE_CELLS,
     STATE_DISPLACEMENT,
 )
-from wlplan.pile import SEED_PILES
-from wlplan.simulator import STOP_REASONS
+from wlplan.terrain.seed_piles import SEED_PILES
 from wlplan.types import Action, Characteristics, Pose
-from wlplan.units import CELL_SIZE
 
 LOADS = 30
 """Consecutive loadings of a rollout. Paper, section 6.2."""

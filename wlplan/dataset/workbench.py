@@ -13,9 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from wlplan.characteristics import as_vector, characteristics
+from wlplan.constants import CELL_SIZE, J_PER_KJ
 from wlplan.dataset.protocol import Rollout
-from wlplan.heightmap import (
+from wlplan.engines.simulator import Simulator
+from wlplan.engines.simulator.cycle import State, advance, begin, outcome
+from wlplan.terrain.characteristics import as_vector, characteristics
+from wlplan.terrain.heightmap import (
     PERFORMANCE_CELLS,
     PERFORMANCE_DISPLACEMENT,
     STATE_CELLS,
@@ -24,10 +27,7 @@ from wlplan.heightmap import (
     sample,
     to_world,
 )
-from wlplan.simulator import Simulator
-from wlplan.simulator.cycle import State, advance, begin, outcome
 from wlplan.types import Action, LocalHeightmap, Pile, Pose
-from wlplan.units import CELL_SIZE, J_PER_KJ
 
 # Cycles that one process computes side by side. Of half as many a time step takes 1.4 times as long
 # a cycle, of twice as many no less; more leave more idle when the last rollouts are played.

@@ -18,12 +18,13 @@ from typing import IO, Any
 
 import numpy as np
 
-from wlplan.automaton import Schedule
 from wlplan.dataset.protocol import Rollout
 from wlplan.dataset.workbench import Bench
-from wlplan.machine import Soil, WheelLoader
-from wlplan.simulator import Simulator
-from wlplan.simulator.cycle import Settings
+from wlplan.engines.simulator import Simulator
+from wlplan.engines.simulator.cycle import Settings
+from wlplan.site.machine import WheelLoader
+from wlplan.site.soil import Soil
+from wlplan.terrain.automaton import Schedule
 
 
 def main() -> None:

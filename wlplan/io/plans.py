@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.errors import InputError
 from wlplan.io.files import check_is_file, named, one_line, write_text_atomic
-from wlplan.precision import floats
 from wlplan.types import Action, LoadingPlan, Performance, Pose
-from wlplan.units import ACTION_HIGH, ACTION_LOW
+from wlplan.xla import floats
 
 PLAN_FORMAT = "wlplan.plan/1"
 

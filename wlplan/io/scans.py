@@ -28,13 +28,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy import ndimage
 
+from wlplan.constants import CELL_SIZE
 from wlplan.errors import InputError
-from wlplan.ground import estimate_ground, fill_unseen
 from wlplan.io.files import check_is_file, named, one_line, write_bytes_atomic
-from wlplan.pile import ground_height, resample
-from wlplan.precision import floats
+from wlplan.terrain.floor import estimate_ground, fill_unseen
+from wlplan.terrain.resampling import resample
 from wlplan.types import Pile
-from wlplan.units import CELL_SIZE
+from wlplan.xla import floats
 
 # Shortest side of a map that a bucket with its surroundings fits into [m], a little more than the
 # 3.6 m window of the models, and most cells a side that are taken.
@@ -91,7 +91,7 @@ def read_pile(
     Args:
         path: File to read.
         ground: Floor under the pile [m] in the file's frame: a level, or a map on the grid of the
-            file. By default that of the file, else `wlplan.ground.estimate_ground` finds it around
+            file. By default that of the file, else `terrain.floor.estimate_ground` finds it around
             the toe. It is lowered to the surface wherever it lies above.
 
     Returns:
@@ -424,7 +424,7 @@ def write_pile(path: str | os.PathLike[str], pile: Pile) -> None:
         "height": np.asarray(pile.height),
         "cell_size": np.float64(pile.cell_size),
         "origin": np.asarray(pile.origin),
-        "ground": np.asarray(ground_height(pile)),
+        "ground": np.asarray(pile.floor),
     }
     if pile.valid is not None:
         fields["valid"] = np.asarray(pile.valid)

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 from flax import nnx, struct
 from jaxtyping import Array, Float
 
-from wlplan.heightmap import STATE_CELLS, take
+from wlplan.constants import CELL_SIZE
 from wlplan.models.layers import Mlp, Standardiser, principal_components
 from wlplan.models.pile_state import check_cells
+from wlplan.terrain.heightmap import STATE_CELLS, take
 from wlplan.types import LocalHeightmap
-from wlplan.units import CELL_SIZE
 
 # Components of the maps and of the changes that are kept. Over held-out cycles of our simulator
 # 128 components leave 0.08 m³ of a change of 1.8 m³ unexplained; with 64 and 192 in place of 48 and

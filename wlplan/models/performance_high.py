@@ -13,9 +13,7 @@ import jax.numpy as jnp
 from flax import nnx, struct
 from jaxtyping import Array, Float
 
-from wlplan.characteristics import as_vector, characteristics
 from wlplan.errors import InputError
-from wlplan.heightmap import PERFORMANCE_CELLS
 from wlplan.models.layers import (
     ACTIVATIONS,
     Mlp,
@@ -27,12 +25,9 @@ from wlplan.models.layers import (
     soft_clamp,
 )
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.performance import (
-    INPUTS,
-    OUTPUTS,
-    bounded_performance,
-    performance_and_variance,
-)
+from wlplan.models.performance import INPUTS, OUTPUTS, bounded_performance, performance_and_variance
+from wlplan.terrain.characteristics import as_vector, characteristics
+from wlplan.terrain.heightmap import PERFORMANCE_CELLS
 from wlplan.types import LocalHeightmap, Performance
 
 ENCODERS = ("convolutional", "principal")

@@ -19,8 +19,8 @@ from flax import nnx, struct
 from jaxtyping import Array, Float
 
 from wlplan.errors import InputError
-from wlplan.heightmap import STATE_CELLS
 from wlplan.models.layers import Mlp, resize
+from wlplan.terrain.heightmap import STATE_CELLS
 from wlplan.types import LocalHeightmap
 
 LATENT = 64

@@ -5,6 +5,7 @@ they are, where they come from, how good they are, and which bytes belong to the
 was cut short goes on where it stopped and ends with the same weights.
 """
 
+from wlplan.models.storage import MODEL_FORMAT, load_model, read_description, save_model
 from wlplan.training.evaluation import Errors, EvaluationReport, evaluate_performance
 from wlplan.training.fitting import LOSSES
 from wlplan.training.performance import held_out, shares_piles, train_psi_high, train_psi_low
@@ -14,7 +15,6 @@ from wlplan.training.pile_state import (
     train_phi,
     train_phi_vae,
 )
-from wlplan.training.storage import MODEL_FORMAT, load_model, read_description, save_model
 from wlplan.training.weights import train_all
 
 __all__ = [

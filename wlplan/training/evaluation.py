@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
 from wlplan.errors import InputError
 from wlplan.models.ensemble import PERCENT_90, Ensemble, members_of
 from wlplan.models.performance import PerformanceModel
 from wlplan.models.performance_high import HighPerformanceModel
 from wlplan.types import LocalHeightmap, Performance
-from wlplan.units import CELL_SIZE
 
 QUANTITIES = ("mass", "time", "work")
 """What a loading yields and costs [tonne, s, kJ]."""

@@ -14,15 +14,15 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
+from wlplan.constants import CELL_SIZE, KG_PER_TONNE
 from wlplan.dataset import Dataset
 from wlplan.errors import InputError
-from wlplan.heightmap import STATE_DISPLACEMENT
 from wlplan.models.height_change import HeightChange, HeightChangeModel
 from wlplan.models.pile_state import Phi, PileStateModel, scaled
+from wlplan.terrain.heightmap import STATE_DISPLACEMENT
 from wlplan.training.fitting import Recipe, evenly, mirror_some
 from wlplan.training.session import Session
 from wlplan.types import LocalHeightmap, PyTree
-from wlplan.units import CELL_SIZE, KG_PER_TONNE
 
 # Density where a data set does not name its soil [kg/m³]: gravel. Paper, table of the simulator.
 _DENSITY = 1727.0

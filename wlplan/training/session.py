@@ -10,10 +10,11 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from flax import nnx
 
-from wlplan.dataset import Dataset, fingerprint, join, probes_of, split, versions
+from wlplan.dataset import Dataset, fingerprint, join, probes_of, split
 from wlplan.errors import InputError
+from wlplan.io.provenance import versions
+from wlplan.models.storage import Model, architecture, check_target, kind_of_network, save_model
 from wlplan.training.fitting import Loss, Recipe, SavedState, fitted
-from wlplan.training.storage import Model, architecture, check_target, kind_of_network, save_model
 from wlplan.types import PyTree
 
 # Training, validation and test. Paper, section 6.4: 10,718 cycles, 1,072 of them for the test,

@@ -7,12 +7,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from wlplan.dataset import collect, fingerprint, open_dataset, versions
+from wlplan.dataset import collect, fingerprint, open_dataset
 from wlplan.dataset.store import is_new, read_attributes
 from wlplan.errors import InputError
+from wlplan.io.provenance import versions
+from wlplan.models.storage import load_model, read_description
 from wlplan.training.performance import train_psi_high, train_psi_low
 from wlplan.training.pile_state import train_phi
-from wlplan.training.storage import load_model, read_description
 
 
 class _Part(NamedTuple):

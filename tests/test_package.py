@@ -1,0 +1,111 @@
+"""What every module must have. What it may import is a contract in pyproject.toml."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "wlplan"
+
+
+def modules(package):
+    """Name below the package -> file; a package has the name of its directory."""
+    found = {}
+    for path in sorted(package.rglob("*.py")):
+        parts = path.relative_to(package).with_suffix("").parts
+        parts = parts[:-1] if parts[-1] == "__init__" else parts
+        found[".".join(parts)] = path
+    return found
+
+
+def undocumented(name, source):
+    """Public definitions without a docstring."""
+    tree = ast.parse(source)
+    missing = [] if ast.get_docstring(tree) else [name]
+
+    def visit(body, prefix):
+        for node in body:
+            if isinstance(node, ast.If | ast.Try):
+                visit(node.body, prefix)
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                continue
+            if node.name.startswith("_"):
+                continue
+            if not ast.get_docstring(node):
+                missing.append(f"{prefix}.{node.name}")
+            if isinstance(node, ast.ClassDef):
+                visit(node.body, f"{prefix}.{node.name}")
+
+    visit(tree.body, name)
+    return missing
+
+
+def prints(source):
+    """Lines that call `print`."""
+    return [
+        node.lineno
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "print"
+    ]
+
+
+FILES = modules(PACKAGE)
+
+
+def test_everything_public_has_a_docstring():
+    missing = [
+        entry for name, path in FILES.items() for entry in undocumented(name, path.read_text())
+    ]
+    assert not missing, missing
+
+
+def test_only_the_command_line_prints():
+    found = {
+        name: prints(path.read_text())
+        for name, path in FILES.items()
+        if name.split(".")[0] != "cli"
+    }
+    assert not any(found.values()), {name: lines for name, lines in found.items() if lines}
+
+
+def test_importing_the_package_is_light():
+    code = "import sys, wlplan; print(sorted({'jax', 'flax', 'matplotlib'} & set(sys.modules)))"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert result.stdout.strip() == "[]"
+
+
+def test_every_public_name_exists_where_the_package_says():
+    """Read off the files, since importing all of them takes seconds."""
+    import wlplan
+
+    public = set()
+    for node in ast.parse((PACKAGE / "__init__.pyi").read_text()).body:
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        defined = set()
+        for inner in ast.parse(FILES[node.module].read_text()).body:
+            if isinstance(inner, ast.ImportFrom):
+                defined |= {alias.asname or alias.name for alias in inner.names}
+            elif isinstance(inner, ast.Assign):
+                defined |= {t.id for t in inner.targets if isinstance(t, ast.Name)}
+            elif hasattr(inner, "name"):
+                defined.add(inner.name)
+        names = {alias.name for alias in node.names}
+        assert names <= defined, (node.module, names - defined)
+        public |= names
+    assert set(wlplan.__all__) == public <= set(dir(wlplan))
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = wlplan.no_such_name
+
+
+def test_the_checks_of_docstrings_and_prints_can_fail():
+    source = '"""Doc."""\nclass A:\n    """Doc."""\n    def b(self): print(1)\ndef _c(): pass\n'
+    assert undocumented("m", source) == ["m.A.b"]
+    assert undocumented("m", "x = 1") == ["m"]
+    assert prints(source) == [4]

@@ -1,0 +1,34 @@
+"""Names of the package and where they are defined; read by `lazy_loader` and by type checkers."""
+
+from .engines.dem.world import DiscreteElements as DiscreteElements
+from .engines.simulator import Simulator as Simulator
+from .errors import InputError as InputError
+from .io import read_pile as read_pile
+from .io import read_plan as read_plan
+from .io import write_pile as write_pile
+from .planning.objective import OBJECTIVES as OBJECTIVES
+from .planning.objective import Objective as Objective
+from .planning.plan import PlanResult as PlanResult
+from .planning.plan import plan_loads as plan_loads
+from .planning.plan import play as play
+from .planning.rollout import rollout as rollout
+from .planning.transport import Receiver as Receiver
+from .site.presets import machine_named as machine_named
+from .site.presets import soil_named as soil_named
+from .studies.diggability import DiggabilityMap as DiggabilityMap
+from .studies.diggability import diggability_map as diggability_map
+from .terrain.automaton import relax as relax
+from .terrain.seed_piles import seed_pile as seed_pile
+from .terrain.toe import toe_contour as toe_contour
+from .types import Action as Action
+from .types import Characteristics as Characteristics
+from .types import LoadingPlan as LoadingPlan
+from .types import LocalHeightmap as LocalHeightmap
+from .types import Performance as Performance
+from .types import Pile as Pile
+from .types import Pose as Pose
+from .types import Rollout as Rollout
+from .types import World as World
+from .worlds.library import load_world as load_world
+
+__version__: str

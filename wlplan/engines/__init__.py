@@ -1,0 +1,1 @@
+"""What plays a loading cycle: the simulator, and discrete elements."""

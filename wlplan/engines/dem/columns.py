@@ -1,0 +1,86 @@
+"""Heightmaps of spheres: the volume that stands in each column, and the envelope from above.
+
+The grid is that of `terrain.heightmap.local_axes(CELLS, DISPLACEMENT)`: wide enough for all of the
+engine's domain, so that no soil flows across its edge.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from wlplan.constants import CELL_SIZE
+
+CELLS, DISPLACEMENT = 84, 2.0
+"""Cells a side, and how far the map begins before the dig location [m]."""
+
+# Standard deviation to which the maps are smoothed [m]: as little as hides single spheres. Sharing
+# a sphere's volume among four cells spreads it by a cell over the root of six.
+_COLUMN_SPREAD = 0.13
+_SHARED = CELL_SIZE / np.sqrt(6.0)
+_ENVELOPE_SPREAD = 0.10
+
+
+def axes() -> tuple[np.ndarray, np.ndarray]:
+    """Positions of the rows ahead of, and of the columns left of, the dig location [m]."""
+    count = np.arange(CELLS)
+    return count * CELL_SIZE - DISPLACEMENT, (count - (CELLS - 1) / 2) * CELL_SIZE
+
+
+def cells_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Positions [m] in units of cells, shape [2, n]."""
+    return np.stack([x + DISPLACEMENT, y]) / CELL_SIZE + np.array([[0.0], [(CELLS - 1) / 2]])
+
+
+def column_height(centre: np.ndarray, radius: np.ndarray, packing: float) -> np.ndarray:
+    """Bulk volume in each column over its area [m]: it sums up to the bulk volume exactly.
+
+    Args:
+        centre: Centres of the spheres [m], shape [n, 3].
+        radius: Their radii [m], shape [n].
+        packing: Part of the bulk volume that is solid.
+    """
+    volume = 4.0 / 3.0 * np.pi * radius**3 / packing
+    # What lies beyond the grid counts in its outermost cells.
+    u = np.clip(cells_of(centre[:, 0], centre[:, 1]), 0.0, CELLS - 1.0)
+    low = np.minimum(u.astype(int), CELLS - 2)
+    part = u - low
+    height = np.zeros((CELLS, CELLS))
+    for i in (0, 1):
+        for j in (0, 1):
+            share = np.abs(1 - i - part[0]) * np.abs(1 - j - part[1])
+            np.add.at(height, (low[0] + i, low[1] + j), share * volume)
+    spread = np.sqrt(_COLUMN_SPREAD**2 - _SHARED**2) / CELL_SIZE
+    # Reflecting at the edges keeps the sum.
+    return gaussian_filter(height / CELL_SIZE**2, spread, mode="reflect")
+
+
+def envelope(centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Upper surface of the spheres over the floor, smoothed: what a scanner sees [m].
+
+    Args:
+        centre: Centres of the spheres [m], shape [n, 3].
+        radius: Their radii [m], shape [n].
+    """
+    fine = 2  # parts of a cell
+    size = CELL_SIZE / fine
+    count = CELLS * fine
+    # Fine cell [0, 0] is centred half a fine cell before the middle of cell [0, 0].
+    u = cells_of(centre[:, 0], centre[:, 1]) * fine + (fine - 1) / 2
+    nearest = np.round(u).astype(int)
+    reach = int(np.ceil(radius.max(initial=0.0) / size))
+    top = np.zeros((count, count))
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            cell = nearest + np.array([[i], [j]])
+            rest = radius**2 - size**2 * ((cell - u) ** 2).sum(axis=0)
+            hit = (rest > 0.0) & (cell >= 0).all(axis=0) & (cell < count).all(axis=0)
+            np.maximum.at(top, tuple(cell[:, hit]), centre[hit, 2] + np.sqrt(rest[hit]))
+    smooth = gaussian_filter(top, _ENVELOPE_SPREAD / size, mode="nearest")
+    return smooth.reshape(CELLS, fine, CELLS, fine).mean(axis=(1, 3))
+
+
+def centre_line(height: np.ndarray) -> np.ndarray:
+    """Mean height of the four columns nearest to the centre line [m], shape [cells]."""
+    middle = CELLS // 2
+    return height[:, middle - 2 : middle + 2].mean(axis=1)

@@ -1,0 +1,8 @@
+"""The simulator: a loading cycle of a wheel loader on a heightfield. Paper, section 5."""
+
+from wlplan.engines.limits import STOP_REASONS
+from wlplan.engines.simulator.cycle import Cycle, Settings, dig
+from wlplan.engines.simulator.trajectory import Trajectory, trace
+from wlplan.engines.simulator.world import Simulator
+
+__all__ = ["STOP_REASONS", "Cycle", "Settings", "Simulator", "Trajectory", "dig", "trace"]

@@ -1,0 +1,106 @@
+"""The simulator as a World: a cycle on the local heightfield, written back, and left to slide."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from wlplan.constants import J_PER_KJ, KG_PER_TONNE
+from wlplan.engines.simulator.cycle import Cycle, Settings, dig
+from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.soil import GRAVEL, Soil
+from wlplan.terrain.automaton import DEFAULT_SCHEDULE, Schedule, settle_dug, window_of
+from wlplan.terrain.heightmap import (
+    STATE_CELLS,
+    STATE_DISPLACEMENT,
+    add_local_change,
+    local_points,
+    sample,
+)
+from wlplan.types import Action, Performance, Pile, Pose
+
+
+@no_type_check
+class Simulator(struct.PyTreeNode):
+    """A World that plays the loading cycle; all fields are static."""
+
+    machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
+    soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
+    settings: Settings = struct.field(pytree_node=False, default=Settings())
+    schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
+
+    def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+        """The pile and the performance after one loading."""
+        after, performance, _ = self.play(pile, pose, action)
+        return after, performance
+
+    def play(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance, Cycle]:
+        """One loading with its record.
+
+        The loader stands on the floor at the dig location, level; a floor that rises into the
+        pile limits the cut from below.
+
+        Args:
+            pile: Pile before.
+            pose: Dig location and heading.
+            action: Parameters of the bucket-filling controller.
+
+        Returns:
+            The pile after, relaxed; the performance, whose work includes the wheels' slip; and
+            the record of the cycle in SI units.
+        """
+        height, ground = self.view(pile, pose)
+        cycle = dig(
+            height,
+            ground,
+            action,
+            machine=self.machine,
+            soil=self.soil,
+            settings=self.settings,
+        )
+        return *self.leave(pile, pose, height, cycle), cycle
+
+    def view(self, pile: Pile, pose: Pose) -> tuple[Float[Array, "52 52"], Float[Array, "52 52"]]:
+        """Surface and floor in the local frame of a dig pose, over the floor there [m]."""
+        window, _ = window_of(pile, pose)
+        points = local_points(pose, STATE_CELLS, STATE_DISPLACEMENT, pile.height.dtype)
+        if window.ground is None:
+            height = sample(window.height, window, *points)
+            return height, jnp.zeros_like(height)
+        level = sample(window.ground, window, pose.x, pose.y)
+        height = sample(window.height, window, *points) - level
+        return height, sample(window.ground, window, *points) - level
+
+    def leave(
+        self, pile: Pile, pose: Pose, height: Float[Array, "52 52"], cycle: Cycle
+    ) -> tuple[Pile, Performance]:
+        """Writes a loading back to its pile.
+
+        Args:
+            pile: Pile before.
+            pose: Dig location and heading.
+            height: Surface before in the local frame, see `view` [m].
+            cycle: Record of the loading.
+
+        Returns:
+            The pile after, relaxed, and the performance, as `play` does.
+        """
+        window, start = window_of(pile, pose)
+        # What left the grid is the load: float rounding of the time stepping goes to the mass.
+        change = cycle.height - height
+        dug = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+        after = settle_dug(
+            pile,
+            dug,
+            start,
+            repose_angle=self.soil.repose_angle,
+            schedule=self.schedule,
+        )
+        work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
+        performance = Performance(
+            mass=cycle.mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ
+        )
+        return after, performance

@@ -1,0 +1,307 @@
+"""Models on disk: an orbax checkpoint of the weights, and a description of them."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from wlplan.constants import CELL_SIZE
+from wlplan.errors import InputError
+from wlplan.io.provenance import command, versions
+from wlplan.models.ensemble import Ensemble, members_of
+from wlplan.models.height_change import HeightChange, HeightChangeModel
+from wlplan.models.normaliser import Normaliser
+from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel, PsiLow
+from wlplan.models.performance_high import HighPerformanceModel, PsiHigh
+from wlplan.models.pile_state import Phi, PileStateModel
+from wlplan.terrain.heightmap import (
+    PERFORMANCE_CELLS,
+    PERFORMANCE_DISPLACEMENT,
+    STATE_CELLS,
+    STATE_DISPLACEMENT,
+)
+
+MODEL_FORMAT = "wlplan.model/1"
+
+Model = PerformanceModel | HighPerformanceModel | HeightChangeModel | PileStateModel | Ensemble
+
+GRID: dict[str, float] = {
+    "cell_size": CELL_SIZE,
+    "performance_cells": PERFORMANCE_CELLS,
+    "performance_displacement": PERFORMANCE_DISPLACEMENT,
+    "state_cells": STATE_CELLS,
+    "state_displacement": STATE_DISPLACEMENT,
+}
+"""The local maps that the models look at: spacing [m], cells a side, displacement [m]."""
+
+_DESCRIPTION, _WEIGHTS = "model.json", "weights"
+
+# Of each kind: the model, its network, and the normalisers with the numbers in each.
+_KINDS: dict[str, tuple[Any, Any, dict[str, int]]] = {
+    "psi_low": (PerformanceModel, PsiLow, {"inputs": INPUTS, "outputs": OUTPUTS}),
+    "psi_high": (HighPerformanceModel, PsiHigh, {"maps": 1, "inputs": INPUTS, "outputs": OUTPUTS}),
+    "phi": (HeightChangeModel, HeightChange, {}),
+    "phi_vae": (PileStateModel, Phi, {}),
+}
+
+
+def kind_of(model: Model) -> str:
+    """The name under which a model is saved."""
+    made = type(members_of(model))
+    return next(kind for kind, (known, _, _) in _KINDS.items() if known is made)
+
+
+def kind_of_network(network: Any) -> str:
+    """The name under which the model of a network is saved."""
+    return next(kind for kind, (_, made, _) in _KINDS.items() if isinstance(network, made))
+
+
+def architecture(network: Any) -> dict[str, Any]:
+    """What a network has to be built with anew."""
+    kind = kind_of_network(network)
+    parts = {"psi_high": "head", "phi": "weights", "phi_vae": "step"}
+    perceptron = getattr(network, parts[kind]) if kind in parts else network
+    record = {
+        "hidden": [layer.out_features for layer in perceptron.hidden],
+        "dropout": perceptron.dropout.rate,
+    }
+    if kind != "phi_vae":
+        record["activation"] = perceptron.activation
+    if kind == "psi_low":
+        record["standardised"] = network.scale_in is not None
+    if kind == "psi_high":
+        record["encoder"] = network.encoder_name
+    if kind in ("psi_low", "psi_high"):
+        record["scattered"] = perceptron.scatter is not None
+    return record
+
+
+def _network(kind: str, record: Mapping[str, Any]) -> Any:
+    settings = {**record, "hidden": tuple(record["hidden"])}
+    if kind == "psi_low":
+        # Models of before the standardisation do not name it.
+        settings.setdefault("standardised", False)
+    return _KINDS[kind][1](rngs=nnx.Rngs(0), **settings)
+
+
+def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[str, Any]) -> None:
+    """Saves a model as a directory, in one piece or not at all.
+
+    Args:
+        directory: Directory to write; an older model there is replaced.
+        model: Model to save.
+        meta: Further fields of `model.json`: data set, training, errors.
+
+    Raises:
+        InputError: If something that is not a model is there, or it cannot be written.
+    """
+    import orbax.checkpoint as ocp
+
+    directory = Path(directory)
+    check_target(directory)
+    kind = kind_of(model)
+    member = members_of(model)
+    network = nnx.merge(member.graph, member.params)
+    # Arrays of the host: the checkpoint then holds no devices, and loads on any.
+    weights = jax.tree.map(np.asarray, nnx.to_pure_dict(member.params))
+    token = secrets.token_hex(4)
+    beside = directory.with_name(f".{directory.name}.{token}.tmp").absolute()
+    old = directory.with_name(f".{directory.name}.{token}.old")
+    try:
+        try:
+            beside.mkdir(parents=True)
+            with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
+                checkpointer.save(beside / _WEIGHTS, args=ocp.args.PyTreeSave(weights))
+            # Names the directory it was made in, and nothing reads it on a file system that
+            # renames in one step.
+            (beside / _WEIGHTS / "commit_success.txt").unlink(missing_ok=True)
+            description = {
+                "format": MODEL_FORMAT,
+                "kind": kind,
+                "architecture": architecture(network),
+                "normaliser": {
+                    name: _normaliser_to_dict(getattr(member, name)) for name in _KINDS[kind][2]
+                },
+                "grid": GRID,
+                **({"ensemble": _ensemble_to_dict(model)} if isinstance(model, Ensemble) else {}),
+                "command": command(),
+                "versions": versions(),
+                **meta,
+                "files": _digests(beside / _WEIGHTS),
+            }
+            text = json.dumps(description, indent=2, allow_nan=False) + "\n"
+            (beside / _DESCRIPTION).write_text(text, "utf-8")
+            if directory.exists():
+                os.replace(directory, old)
+            os.replace(beside, directory)
+        except BaseException:
+            if old.exists() and not directory.exists():
+                os.replace(old, directory)
+            raise
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise InputError(
+            f"{directory}: cannot be written ({reason}): choose another place."
+        ) from error
+
+
+def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Model:
+    """Reads a model; writes nothing, so the directory may be read-only.
+
+    Args:
+        directory: Where `save_model` wrote it.
+        kind: "psi_low", "psi_high", "phi" (ours) or "phi_vae" (as in the paper).
+
+    Returns:
+        The model; an `Ensemble` if there are several of it.
+
+    Raises:
+        InputError: If it is missing, damaged, of another format or kind, or for another grid.
+    """
+    import orbax.checkpoint as ocp
+
+    directory = Path(directory)
+    description = read_description(directory, kind)
+    # Models of before it was recorded do not name their grid; there has been one only.
+    if description.get("grid", GRID) != GRID:
+        raise InputError(
+            f"{directory}: was trained on local maps of another grid than today's "
+            f"({_of_grid(description['grid'])}): train it again."
+        )
+    try:
+        shape = description["architecture"]
+        graph, params = nnx.split(nnx.eval_shape(lambda: _network(kind, shape)))
+        members, factor = _ensemble_of_dict(description.get("ensemble"))
+        if members:
+            params = jax.tree.map(
+                lambda leaf: jax.ShapeDtypeStruct((members, *leaf.shape), leaf.dtype), params
+            )
+        normalisers = {
+            name: _normaliser_of_dict(description["normaliser"][name], size)
+            for name, size in _KINDS[kind][2].items()
+        }
+        # Checked before orbax reads them: it would report damage at length, or wait.
+        if _digests(directory / _WEIGHTS) != description["files"]:
+            raise ValueError("the weights are not those that were saved")
+        expected = nnx.to_pure_dict(params)
+        as_numpy = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), expected)
+        with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
+            weights = checkpointer.restore(
+                (directory / _WEIGHTS).absolute(),
+                args=ocp.args.PyTreeRestore(item=expected, restore_args=as_numpy),
+            )
+        for want, got in zip(jax.tree.leaves(expected), jax.tree.leaves(weights), strict=True):
+            if want.shape != got.shape:
+                raise ValueError(f"weights of shape {got.shape}, not {want.shape}")
+    except Exception as error:
+        # A damaged description makes anything fail; to the user it means the same.
+        what = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{directory}: is damaged ({what}): copy or train it again.") from error
+    nnx.replace_by_pure_dict(params, jax.tree.map(jnp.asarray, weights))
+    model = _KINDS[kind][0](params=params, graph=graph, **normalisers)
+    return Ensemble(model, factor) if members else model
+
+
+def read_description(
+    directory: str | os.PathLike[str], kind: str | None = "psi_low"
+) -> dict[str, Any]:
+    """The content of the `model.json` of a saved model.
+
+    Args:
+        directory: Where `save_model` wrote it.
+        kind: Kind of model that is expected; None: any.
+
+    Raises:
+        InputError: If it is missing, damaged, or of another format or kind.
+    """
+    directory = Path(directory)
+    if not os.path.lexists(directory):
+        raise InputError(f"{directory}: no such model: check the name, or train it first.")
+    try:
+        description = json.loads((directory / _DESCRIPTION).read_text("utf-8"))
+        found, got = description["format"], description["kind"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{directory}: is not a model of wlplan: name a directory that `wlplan train` wrote."
+        ) from error
+    kinds = tuple(_KINDS) if kind is None else (kind,)
+    if found != MODEL_FORMAT or got not in kinds:
+        raise InputError(
+            f"{directory}: is {got!r} of format {found!r}, not {' or '.join(map(repr, kinds))} of "
+            f"{MODEL_FORMAT!r}: choose another model."
+        )
+    return description
+
+
+def check_target(directory: Path) -> None:
+    """Refuses to replace anything but a model."""
+    place = directory.absolute().parent
+    while not os.path.lexists(place):
+        place = place.parent
+    if not place.is_dir():
+        raise InputError(f"{directory}: {place} is a file: name a directory for the model.")
+    if not os.path.lexists(directory):
+        return
+    if not directory.is_dir():
+        raise InputError(f"{directory}: is a file: name a directory for the model.")
+    with contextlib.suppress(OSError):
+        if any(directory.iterdir()) and not (directory / _DESCRIPTION).is_file():
+            raise InputError(
+                f"{directory}: holds something that is not a model: choose another place."
+            )
+
+
+def _digests(directory: Path) -> dict[str, str]:
+    """Hash of every file below a directory, by its path there."""
+    files = sorted(path for path in directory.rglob("*") if path.is_file())
+    return {
+        path.relative_to(directory).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+    }
+
+
+def _normaliser_to_dict(normaliser: Normaliser) -> dict[str, list[float]]:
+    return {name: np.asarray(getattr(normaliser, name)).tolist() for name in ("low", "span")}
+
+
+def _normaliser_of_dict(record: Mapping[str, Any], size: int) -> Normaliser:
+    parts = [np.array(record[name], np.float32) for name in ("low", "span")]
+    if any(part.shape != (size,) or not np.isfinite(part).all() for part in parts):
+        raise ValueError("the normaliser does not fit")
+    return Normaliser(*(jnp.asarray(part) for part in parts))
+
+
+def _ensemble_to_dict(ensemble: Ensemble) -> dict[str, Any]:
+    return {"members": ensemble.size, "factor": np.asarray(ensemble.factor).tolist()}
+
+
+def _ensemble_of_dict(record: Mapping[str, Any] | None) -> tuple[int, jax.Array]:
+    """Number of members, 0 of a model that is no ensemble, and their factors."""
+    if record is None:
+        return 0, jnp.ones(3)
+    factor = np.array(record["factor"], np.float32)
+    if record["members"] < 2 or factor.shape != (3,) or not (factor > 0.0).all():
+        raise ValueError("the record of the ensemble makes no sense")
+    return int(record["members"]), jnp.asarray(factor)
+
+
+def _of_grid(record: Any) -> str:
+    """What is different about a grid, in words."""
+    found = record if isinstance(record, dict) else {}
+    wrong = (name for name in GRID if found.get(name) != GRID[name])
+    return ", ".join(f"{name} {found.get(name)}, not {GRID[name]:g}" for name in wrong) or "unknown"

@@ -1,0 +1,1 @@
+"""Jobs, objectives, planners and what plays a plan."""

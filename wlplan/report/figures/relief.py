@@ -1,0 +1,150 @@
+"""The map under everything: the relief of a pile, its contour lines, and what was not seen."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+
+from wlplan.report.figures.paper import BLUE, FAINT, INK
+from wlplan.types import Pile
+
+PILE = LinearSegmentedColormap.from_list(
+    "pile", ["#e4e2dc", "#e8d3a8", "#d5a766", "#a97640", "#6b472b"]
+)
+STONE = LinearSegmentedColormap.from_list("stone", ["#eae9e6", "#b4b1ab"])
+
+# Rise above the ground that counts as pile [m], as for the toe contour.
+RISE = 0.15
+# Spacings of contour lines to choose from [m]; the widest that gives at least this many is taken.
+_CONTOUR_STEPS = (2.0, 1.0, 0.5, 0.25, 0.1)
+_LEAST_CONTOURS = 4
+# Ground shown around the pile [m], and how far a truck may stand outside that view, as a part of
+# its side, to be drawn to scale; a truck further away becomes an arrow at the border.
+_MARGIN = 2.0
+
+
+def height_above_ground(pile: Pile) -> Float[np.ndarray, "nx ny"]:
+    """Height of the surface above the ground [m]."""
+    return np.asarray(pile.height, float) - np.asarray(pile.floor, float)
+
+
+def _extent(pile: Pile) -> tuple[float, float, float, float]:
+    """Outer borders of the grid [m]: left, right, bottom, top."""
+    low = np.asarray(pile.origin, float) - 0.5 * pile.cell_size
+    high = low + pile.cell_size * np.array(pile.height.shape)
+    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
+
+
+def view_of(pile: Pile, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
+    """Lower left and upper right corner of what to show [m]: the pile, the points, a margin."""
+    cells = np.argwhere(height_above_ground(pile) > RISE)
+    if len(cells) == 0:
+        cells = np.array([[0, 0], pile.height.shape])
+    shown = np.asarray(pile.origin, float) + pile.cell_size * cells
+    shown = np.concatenate([shown, points])
+    return np.stack([shown.min(axis=0) - _MARGIN, shown.max(axis=0) + _MARGIN])
+
+
+def grow_to_ratio(view: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
+    """Widen the shorter side of a view until neither is more than 1.4 times the other."""
+    size = view[1] - view[0]
+    grow = 0.5 * np.maximum(size.max() / 1.4 - size, 0.0)
+    return np.stack([view[0] - grow, view[1] + grow])
+
+
+def _relief(height: Float[np.ndarray, "nx ny"], cell_size: float) -> Float[np.ndarray, "nx ny"]:
+    """Brightness of a surface lit from the north-west, 1 where it is level."""
+    # Light from 315 degrees at 40 degrees above the horizon; slopes are drawn 1.3 times as steep.
+    elevation, exaggeration = math.radians(40.0), 1.3
+    east, north = np.gradient(exaggeration * height, cell_size)
+    light = np.array([-math.sqrt(0.5), math.sqrt(0.5)]) * math.cos(elevation)
+    facing = (math.sin(elevation) - east * light[0] - north * light[1]) / np.sqrt(
+        1.0 + east**2 + north**2
+    )
+    return np.clip(1.0 + 0.6 * (facing - math.sin(elevation)), 0.4, 1.13)
+
+
+def draw_pile(
+    panel: Axes,
+    pile: Pile,
+    colours: LinearSegmentedColormap,
+    norm: Normalize,
+    *,
+    contour_alpha: float = 0.55,
+) -> None:
+    """Shaded heights above the ground, contour lines, and hatching over unseen cells."""
+    above = height_above_ground(pile)
+    surface = np.asarray(pile.height, float)
+    image = colours(norm(above))[..., :3] * _relief(surface, pile.cell_size)[..., np.newaxis]
+    panel.imshow(
+        np.clip(image, 0.0, 1.0).transpose(1, 0, 2),
+        origin="lower",
+        extent=_extent(pile),
+        interpolation="bilinear",
+        zorder=1,
+    )
+    x, y = _axes_of(pile)
+    step = _contour_step(float(norm.vmax or 0.0))
+    levels = np.arange(step, float(above.max()), step)
+    if levels.size:
+        panel.contour(
+            x, y, above.T, levels, colors=INK, linewidths=0.5, alpha=contour_alpha, zorder=2
+        )
+    if pile.valid is not None and not np.asarray(pile.valid).all():
+        _hatch(panel, pile, ~np.asarray(pile.valid))
+
+
+def _hatch(panel: Axes, pile: Pile, unseen: Bool[np.ndarray, "nx ny"]) -> None:
+    # A border of seen cells closes the outline of unseen ones at the edge of the map.
+    flags = np.pad(unseen.astype(float), 1)
+    x, y = _axes_of(pile)
+    x, y = (np.concatenate([[2 * a[0] - a[1]], a, [2 * a[-1] - a[-2]]]) for a in (x, y))
+    grey = panel.contourf(
+        x, y, flags.T, levels=[0.5, 1.5], colors=["#f4f4f2"], alpha=0.8, hatches=["////"], zorder=3
+    )
+    grey.set_edgecolor("#9aa1a8")
+    grey.set_linewidth(0.0)
+
+
+def draw_toe(panel: Axes, pile: Pile, style: str) -> None:
+    """Outline of where a pile stands or stood."""
+    above = height_above_ground(pile)
+    if above.max() > RISE:
+        panel.contour(
+            *_axes_of(pile),
+            above.T,
+            levels=[RISE],
+            colors=[BLUE],
+            linewidths=0.9,
+            linestyles=style,
+            zorder=4,
+        )
+
+
+def _axes_of(pile: Pile) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " ny"]]:
+    """Positions of the cell centres along x and y [m]."""
+    origin = np.asarray(pile.origin, float)
+    nx, ny = pile.height.shape
+    return origin[0] + pile.cell_size * np.arange(nx), origin[1] + pile.cell_size * np.arange(ny)
+
+
+def _contour_step(highest: float) -> float:
+    """Spacing of contour lines for a pile of that height [m]."""
+    return next((s for s in _CONTOUR_STEPS if highest / s >= _LEAST_CONTOURS), _CONTOUR_STEPS[-1])
+
+
+def add_legend(figure: Figure, pile: Pile) -> None:
+    """One line under the maps that says what their lines mean."""
+    parts = [
+        f"contour lines every {_contour_step(float(height_above_ground(pile).max())):g} m",
+        "dot: dig location, arrow: heading, number: order",
+        "blue outline: toe before",
+    ]
+    if pile.valid is not None and not np.asarray(pile.valid).all():
+        parts.append("hatched: not seen by the scan")
+    figure.supxlabel("   ·   ".join(parts), fontsize=8.5, color=FAINT)

@@ -1,0 +1,97 @@
+"""The truck on a map, or an arrow towards it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.patches import Polygon
+
+from wlplan.planning.transport import Receiver
+from wlplan.report.figures.paper import INK, PALE, add_arrow
+
+_TRUCK_REACH = 0.75
+# Body of the truck that is drawn [m]: length and width of a small hauler. Only a symbol.
+_TRUCK_SIZE = (7.0, 2.6)
+
+
+@dataclasses.dataclass(frozen=True)
+class Truck:
+    """A truck that stands across the end of the loader's way; corners and points [m]."""
+
+    receiver: Receiver
+
+    @property
+    def ahead(self) -> Float[np.ndarray, "2"]:
+        """Unit vector along the loader's heading."""
+        heading = float(self.receiver.heading)
+        return np.array([math.cos(heading), math.sin(heading)])
+
+    @property
+    def way(self) -> Float[np.ndarray, "2 2"]:
+        """Start and end of the last stretch of the loader's way."""
+        stand = np.array([float(self.receiver.x), float(self.receiver.y)])
+        return np.stack([stand - 4.0 * self.ahead, stand])
+
+    @property
+    def body(self) -> Float[np.ndarray, "4 2"]:
+        """Corners of the body [m]."""
+        return self._box(0.0, 1.0, 1.0)
+
+    @property
+    def bed(self) -> Float[np.ndarray, "4 2"]:
+        """What is loaded: the body without the cab at its left end."""
+        return self._box(-0.10, 0.72, 0.84)
+
+    def _box(self, shift: float, long: float, wide: float) -> Float[np.ndarray, "4 2"]:
+        length, width = _TRUCK_SIZE
+        left = np.array([-self.ahead[1], self.ahead[0]])
+        centre = self.way[1] + (0.5 * width + 0.3) * self.ahead + shift * length * left
+        along, across = 0.5 * long * length * left, 0.5 * wide * width * self.ahead
+        return centre + np.stack([along + across, along - across, -along - across, across - along])
+
+    def is_near(self, view: Float[np.ndarray, "2 2"]) -> bool:
+        """Whether it stands near enough to a view to widen it."""
+        reach = _TRUCK_REACH * np.ptp(view, axis=0).max()
+        return bool(np.all((self.body > view[0] - reach) & (self.body < view[1] + reach)))
+
+
+def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> None:
+    """The truck to scale, or, when it stands far outside the view, an arrow towards it."""
+    centre = truck.body.mean(axis=0)
+    if not np.all((centre > view[0]) & (centre < view[1])):
+        middle = view.mean(axis=0)
+        away = centre - middle
+        reach = float(np.min(0.5 * np.ptp(view, axis=0) / np.maximum(np.abs(away), 1e-9)))
+        panel.annotate(
+            f"truck\n{np.hypot(*away):.0f} m",
+            xy=tuple(middle + 0.98 * reach * away),
+            xytext=tuple(middle + 0.80 * reach * away),
+            ha="center",
+            va="center",
+            fontsize=9,
+            color=INK,
+            arrowprops={"arrowstyle": "-|>", "color": INK},
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 2.0},
+            zorder=10,
+        )
+        return
+    panel.add_patch(
+        Polygon(truck.body, closed=True, facecolor=INK, edgecolor="white", linewidth=0.8, zorder=6)
+    )
+    panel.add_patch(Polygon(truck.bed, closed=True, facecolor=PALE, edgecolor="none", zorder=7))
+    add_arrow(panel, *truck.way, colour=INK, line=1.6, head=11.0, zorder=7)
+    panel.annotate(
+        "truck",
+        tuple(truck.way[0]),
+        textcoords="offset points",
+        xytext=tuple(-12.0 * truck.ahead),
+        ha="center",
+        va="center",
+        fontsize=9,
+        color=INK,
+        zorder=8,
+    )

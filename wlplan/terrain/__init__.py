@@ -1,0 +1,1 @@
+"""Piles on a grid and everything that changes them."""

@@ -1,0 +1,135 @@
+"""The toe of a pile: where a loader drives up to it, and which way it then heads."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+from scipy import ndimage
+
+from wlplan.errors import InputError
+from wlplan.site.machine import WA320
+from wlplan.terrain.outlines import distances_along, largest_outline
+from wlplan.types import Pile
+
+# Spacing of the points of a toe contour [m].
+_CONTOUR_SPACING = 0.1
+# Distance ahead of the toe at which there must still be pile for a point to count [m]: the length
+# of the bucket floor.
+_AHEAD = WA320.bucket_depth
+
+
+@dataclasses.dataclass(frozen=True)
+class ToeContour:
+    """The edge of a pile, world frame, as points a fixed step apart with the pile on their left."""
+
+    points: Float[np.ndarray, "n 2"]  # [m]
+    heading: Float[np.ndarray, " n"]  # into the pile [rad], counter-clockwise from +x
+    length: float  # [m]
+    closed: bool  # False where the pile runs over the edge of the map
+    accessible: Bool[np.ndarray, " n"]  # a bucket can start here on ground that the scan saw
+
+
+def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
+    """Trace the toe of the largest pile, by volume, on the grid.
+
+    The toe is where the surface stands `rise` above the ground. Hollows inside the pile are not
+    part of it. Where the pile runs over the edge of the map, the longest part inside is kept.
+
+    A heading is the inward normal of the chord over one bucket width. A point is accessible if the
+    cutting edge of a bucket there lies inside the map, the scan saw its cell, and the surface a
+    bucket length ahead is still higher than `rise` above the ground.
+
+    Args:
+        pile: One pile, not a batch.
+        rise: Height above the ground that counts as pile [m].
+
+    Raises:
+        InputError: If there is nothing to dig: no cell higher than `rise`, less than 1 m^3, or a
+            footprint narrower than the bucket in every direction.
+    """
+    if not 0.0 < rise < math.inf:
+        raise InputError(f"The rise is {rise:g} m: it has to be positive.")
+    cell = pile.cell_size
+    above = np.asarray(pile.height, np.float64)
+    if pile.ground is not None:
+        above = above - np.asarray(pile.ground, np.float64)
+    origin = np.asarray(pile.origin, np.float64)
+    line = largest_outline(above, rise=rise, origin=origin, cell=cell)
+    closed = bool(line[0] == line[-1]) and len(line) > 2
+
+    marks = distances_along(line)
+    length = float(marks[-1])
+    count = max(round(length / _CONTOUR_SPACING), 8)
+
+    def along(distance: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
+        """Points at distances along the line [m]; a closed one wraps round, an open one ends."""
+        inside = distance % length if closed else np.clip(distance, 0.0, length)
+        return np.interp(inside, marks, line)
+
+    at = np.linspace(0.0, length, count, endpoint=not closed)
+    points = along(at)
+    # Chords over one bucket width smooth out ripples.
+    half = 0.5 * min(WA320.bucket_width, 0.5 * length)
+    chord = along(at + half) - along(at - half)
+    normal = 1j * chord / np.maximum(np.abs(chord), 1e-9)
+    if closed:
+        # A closed line has the pile inside: the pile is on the left if it runs round to the left.
+        left = float(np.sum(line[:-1].real * line[1:].imag - line[:-1].imag * line[1:].real)) > 0.0
+    else:
+        sides = (_sample(above, points + d * normal, origin, cell).mean() for d in (0.2, -0.2))
+        left = next(sides) >= next(sides)
+    if not left:
+        points, normal = points[::-1], -normal[::-1]
+
+    edge = 0.5j * WA320.bucket_width * normal
+    accessible = (
+        _inside(points - edge, pile.height.shape, origin, cell)
+        & _inside(points + edge, pile.height.shape, origin, cell)
+        & (_sample(above, points + _AHEAD * normal, origin, cell) > rise)
+    )
+    if pile.valid is not None:
+        seen = np.asarray(pile.valid, np.float64)
+        accessible &= _sample(seen, points, origin, cell) > 1.0 - 1e-6
+    pairs = np.stack([points.real, points.imag], axis=-1)
+    return ToeContour(pairs, np.angle(normal), length, closed, accessible)
+
+
+def evenly_spaced(contour: ToeContour, n: int) -> Int[np.ndarray, " n"]:
+    """Indices of `n` accessible points of a contour, evenly spaced along its accessible part.
+
+    Raises:
+        InputError: If the contour has fewer than `n` accessible points.
+    """
+    candidates = np.flatnonzero(contour.accessible)
+    if not 1 <= n <= candidates.size:
+        raise InputError(
+            f"{n} dig locations asked for, but the toe has {candidates.size} accessible points: "
+            f"ask for 1 to {candidates.size}."
+        )
+    return candidates[((np.arange(n) + 0.5) * candidates.size / n).astype(int)]
+
+
+def _inside(
+    points: Complex[np.ndarray, " n"],
+    shape: tuple[int, ...],
+    origin: Float[np.ndarray, "2"],
+    cell: float,
+) -> Bool[np.ndarray, " n"]:
+    cells = (points - complex(*origin)) / cell
+    i, j, last = cells.real, cells.imag, np.array(shape) - 1 + 1e-6
+    return (i >= -1e-6) & (i <= last[0]) & (j >= -1e-6) & (j <= last[1])
+
+
+def _sample(
+    values: Float[np.ndarray, "nx ny"],
+    points: Complex[np.ndarray, " n"],
+    origin: Float[np.ndarray, "2"],
+    cell: float,
+) -> Float[np.ndarray, " n"]:
+    """Bilinear values at points of the world; outside the map those of its edge."""
+    cells = (points - complex(*origin)) / cell
+    at = np.stack([cells.real, cells.imag])
+    return ndimage.map_coordinates(values, at, order=1, mode="nearest")
