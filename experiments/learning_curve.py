@@ -15,6 +15,7 @@ import numpy as np
 
 from experiments.record import described, main
 from experiments.trained import SHORT, shipped, trained
+from wlplan.constants import QUANTITIES
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
@@ -24,7 +25,7 @@ from wlplan.training import evaluate_performance
 
 SIZES, SEEDS = (100, 300, 1000, 3000), 3
 MODELS = {"psi_low": "ψ_low", "psi_high": "ψ_high (ours)"}
-NAMES = ("mass", "time", "work")
+NAMES = tuple(QUANTITIES)
 # With few cycles an epoch has few steps: then there are more epochs.
 LEAST_STEPS, BATCH, EPOCHS = 3000, 128, 150
 # The training function sets a tenth aside for a test of its own, which is not looked at.

@@ -18,6 +18,7 @@ from flax import nnx
 from experiments.learning_curve import MODELS
 from experiments.record import described, main
 from experiments.trained import SHORT, trained
+from wlplan.constants import QUANTITIES
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
@@ -25,7 +26,6 @@ from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.studies.bench.inference import inference_times
 from wlplan.studies.paper import PERFORMANCE
 from wlplan.training import evaluate_performance
-from wlplan.training.evaluation import QUANTITIES
 
 LAYERS, UNITS = (1, 2, 3), (8, 32, 128, 512)
 EPOCHS = 150

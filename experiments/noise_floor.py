@@ -33,7 +33,7 @@ from scipy.spatial import cKDTree
 from experiments.record import described, main
 from experiments.replays import in_batches, surfaces
 from experiments.trained import PSI, SHIPPED, SHORT, shipped, trained
-from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
+from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE, QUANTITIES
 from wlplan.dataset import LOADS, Dataset, split
 from wlplan.engines.simulator import dig
 from wlplan.io import write_bytes_atomic
@@ -46,7 +46,7 @@ from wlplan.types import Action
 
 SEED = 11
 CYCLES, REPEATS = 250, 12
-NAMES = ("mass", "time", "work")
+NAMES = tuple(QUANTITIES)
 MODELS = ("psi_low, swish", "psi_high, swish")
 SHAPE = (STATE_CELLS, STATE_CELLS)
 # More neighbours than these are not looked at in vain: some cycles are not valid.

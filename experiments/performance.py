@@ -14,6 +14,7 @@ import numpy as np
 
 from experiments.record import described, main
 from experiments.trained import PSI, SHORT, trained
+from wlplan.constants import QUANTITIES
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
@@ -23,7 +24,7 @@ from wlplan.training import evaluate_performance
 
 # Trainings of each model; of the paper's ψ_high, which takes five minutes, one.
 SEEDS, SEEDS_OF_THE_PAPERS = 5, 1
-NAMES = ("mass", "time", "work")
+NAMES = tuple(QUANTITIES)
 
 
 def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:

@@ -1,4 +1,8 @@
-"""Constants of nature and of the paper's setting, each with its source."""
+"""Constants of nature and of the paper's setting, each with its source; the quantities of a load."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
 
 # Standard gravity [m/s^2].
 GRAVITY = 9.81
@@ -13,3 +17,19 @@ CELL_SIZE = 0.1
 # Box of the action parameters, in the order of `Action`. Paper, section 6.2.
 ACTION_LOW = (0.0, 0.0, 0.0, 0.0)
 ACTION_HIGH = (0.7, 5.0, 0.7, 5.0)
+
+
+class Quantity(NamedTuple):
+    """How a quantity of a loading is written for people."""
+
+    title: str
+    unit: str
+    digits: int  # after the point, in tables
+
+
+QUANTITIES = {
+    "mass": Quantity("mass", "t", 2),
+    "time": Quantity("time", "s", 1),
+    "work": Quantity("work", "kJ", 0),
+}
+"""The quantities of a `Performance`, by the names of its fields and in their order."""

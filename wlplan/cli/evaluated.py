@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from wlplan.cli.outputs import QUANTITIES, print_table, titled_table
+from wlplan.cli.outputs import print_table, titled_table
+from wlplan.constants import QUANTITIES
 from wlplan.studies.paper import PERFORMANCE, PILE_STATE
 
 

@@ -25,7 +25,6 @@ from wlplan.cli.options import (
     world_option,
 )
 from wlplan.cli.outputs import (
-    QUANTITIES,
     checked_folder,
     json_text,
     print_table,
@@ -33,6 +32,7 @@ from wlplan.cli.outputs import (
     write_files,
 )
 from wlplan.cli.progress import Progress, Stopwatch, ready
+from wlplan.constants import QUANTITIES
 
 _FORMAT = "wlplan.diggability/1"
 _MOST_LOCATIONS = 10_000

@@ -14,9 +14,6 @@ from typing import Any
 
 from wlplan.errors import InputError
 
-QUANTITIES = {"mass": ("mass", "t", 2), "time": ("time", "s", 1), "work": ("work", "kJ", 0)}
-"""Quantity of a performance -> its title, its unit, and its digits after the point in tables."""
-
 
 def checked_folder(name: str) -> Path:
     """A folder to write to, found out to be possible before anything long is begun.

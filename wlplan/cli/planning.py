@@ -36,9 +36,10 @@ from wlplan.cli.options import (
     with_options,
     world_option,
 )
-from wlplan.cli.outputs import QUANTITIES, checked_folder, json_text, remark, staged
+from wlplan.cli.outputs import checked_folder, json_text, remark, staged
 from wlplan.cli.played import ledger_of, print_plan, remark_on_ledger, totals, transport_totals
 from wlplan.cli.progress import Progress, Stopwatch, ready
+from wlplan.constants import QUANTITIES
 
 if TYPE_CHECKING:
     from wlplan.planning.plan import PlanResult

@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from wlplan.cli.outputs import QUANTITIES, print_table, remark, titled_table
+from wlplan.cli.outputs import print_table, remark, titled_table
+from wlplan.constants import QUANTITIES
 
 if TYPE_CHECKING:
     from wlplan.planning.plan import PlanResult

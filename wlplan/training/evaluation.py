@@ -10,16 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wlplan.constants import CELL_SIZE
+from wlplan.constants import CELL_SIZE, QUANTITIES
 from wlplan.dataset import Dataset
 from wlplan.errors import InputError
 from wlplan.models.ensemble import PERCENT_90, Ensemble, members_of
 from wlplan.models.performance import PerformanceModel
 from wlplan.models.performance_high import HighPerformanceModel
 from wlplan.types import LocalHeightmap, Performance
-
-QUANTITIES = ("mass", "time", "work")
-"""What a loading yields and costs [tonne, s, kJ]."""
 
 # Load from which an error relative to it says something [tonne]: a sixth of a full bucket. Of a
 # bucket that comes out nearly empty any error is many times the load.

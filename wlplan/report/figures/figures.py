@@ -12,6 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from wlplan.constants import QUANTITIES
 from wlplan.planning.transport import Receiver
 from wlplan.report.figures.digs import LABEL_PART, draw_digs, label_places
 from wlplan.report.figures.paper import (
@@ -41,8 +42,6 @@ from wlplan.types import LoadingPlan, Performance, Pile
 # Length of the line that marks a location of a diggability map [m]; at most this part of the view.
 _TICK = 1.5
 _TICK_PART = 0.09
-
-_QUANTITIES = (("mass", "mass", "t"), ("time", "time", "s"), ("work", "work", "kJ"))
 
 
 def plan_figure(
@@ -115,7 +114,7 @@ def totals_figure(predicted: Performance, simulated: Performance | None = None) 
     series: list[tuple[str, Performance, str, str]] = [("predicted", predicted, BLUE, "o-")]
     if simulated is not None:
         series.append(("simulated", simulated, ORANGE, "s--"))
-    for column, (name, title, unit) in enumerate(_QUANTITIES):
+    for column, (name, (title, unit, _)) in enumerate(QUANTITIES.items()):
         each, total = panels[0, column], panels[1, column]
         sums = []
         for label, performance, colour, style in series:
@@ -178,7 +177,7 @@ def diggability_figure(pile: Pile, diggability: DiggabilityMap) -> Figure:
     panels = figure.subplots(2, 3, height_ratios=[12.0 / 3.3 * ratio, 1.6])
     norm = Normalize(0.0, max(float(height_above_ground(pile).max()), 0.1))
     colours = colormaps["viridis"]
-    for column, (name, title, unit) in enumerate(_QUANTITIES):
+    for column, (name, (title, unit, _)) in enumerate(QUANTITIES.items()):
         panel, histogram = panels[0, column], panels[1, column]
         label = f"{'Load' if name == 'mass' else 'Loading'} {title}"
         values = np.asarray(getattr(diggability.performance, name), float)
