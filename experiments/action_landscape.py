@@ -22,7 +22,7 @@ from wlplan.constants import ACTION_HIGH, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 from wlplan.engines.simulator import Settings, dig
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import FAINT, new_figure
+from wlplan.report.figures.style import FAINT, new_figure
 from wlplan.site.machine import WA320
 from wlplan.terrain.characteristics import as_vector, characteristics
 from wlplan.terrain.heightmap import (

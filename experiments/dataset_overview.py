@@ -21,7 +21,7 @@ from wlplan.dataset import Dataset
 from wlplan.engines.simulator import dig
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.site.machine import WA320, WheelLoader
 
 SEED = 0

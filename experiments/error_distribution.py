@@ -21,7 +21,7 @@ from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, INK, ORANGE, new_figure, tidy
 from wlplan.site.machine import WA320
 from wlplan.training.evaluation import predict
 

@@ -42,7 +42,7 @@ from wlplan.models.ensemble import Ensemble
 from wlplan.models.performance import PerformanceModel
 from wlplan.models.performance_high import HighPerformanceModel
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, tidy
 from wlplan.terrain.characteristics import as_vector, characteristics
 from wlplan.terrain.heightmap import sample_local
 from wlplan.training.evaluation import sees_map

@@ -22,7 +22,7 @@ from wlplan.constants import QUANTITIES
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.studies.bench.inference import inference_times
 from wlplan.studies.paper import PERFORMANCE
 from wlplan.training import evaluate_performance

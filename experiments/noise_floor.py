@@ -39,7 +39,7 @@ from wlplan.engines.simulator import dig
 from wlplan.io import write_bytes_atomic
 from wlplan.models.performance import PerformanceModel
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, PALE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, ORANGE, PALE, new_figure, tidy
 from wlplan.terrain.heightmap import PERFORMANCE_CELLS, STATE_CELLS, STATE_DISPLACEMENT
 from wlplan.training.evaluation import predict
 from wlplan.types import Action

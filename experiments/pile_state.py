@@ -24,7 +24,7 @@ from wlplan.io import write_bytes_atomic
 from wlplan.models.pile_state import PileStateModel
 from wlplan.models.storage import load_model
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, GREEN, INK, ORANGE, PALE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, GREEN, INK, ORANGE, PALE, new_figure, tidy
 from wlplan.studies.paper import PILE_STATE
 from wlplan.terrain.heightmap import STATE_DISPLACEMENT
 from wlplan.training.pile_state import misplaced_volume, pile_state_errors, predict_pile_state

@@ -17,7 +17,7 @@ from wlplan.planning.plan import PLANNERS, play
 from wlplan.planning.planners.gradient import GradientSettings
 from wlplan.planning.planners.search import SearchSettings
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 
 KINDS = ("conical", "triangular", "wedge")
 SLOPE_DEGREES, SEED, LOADS = 30.0, 1, 15

@@ -20,7 +20,7 @@ from experiments.trained import shipped
 from wlplan.dataset import Dataset
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.training import held_out
 from wlplan.training.evaluation import predict_with_deviation
 

@@ -30,7 +30,7 @@ from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic
 from wlplan.models.height_change import HeightChangeModel
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, INK, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, INK, ORANGE, new_figure, tidy
 from wlplan.studies.paper import SEQUENCE, SEQUENCE_LOADS
 from wlplan.types import Action, Performance, Pile, Pose, World, action_from
 from wlplan.worlds.library import HighWorld, HybridWorld, LowWorld, load_world

@@ -25,7 +25,7 @@ from wlplan.dataset.protocol import Rollout, choose_pose
 from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.types import Pile, Pose, action_from
 
 SEED = 7

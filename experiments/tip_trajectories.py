@@ -22,7 +22,7 @@ from wlplan.dataset import Dataset
 from wlplan.engines.simulator import Trajectory, trace
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.paper import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.terrain.heightmap import STATE_CELLS, STATE_DISPLACEMENT, local_axes
 
 SEED = 0

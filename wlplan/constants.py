@@ -1,4 +1,4 @@
-"""Constants of nature and of the paper's setting, each with its source; the quantities of a load."""
+"""Constants of nature and of the paper, each with its source; the quantities of a load."""
 
 from __future__ import annotations
 

@@ -1,10 +1,14 @@
 """Figures: a plan on its pile, predicted beside simulated totals, diggability maps.
 
-Every function returns a matplotlib figure that is bound to no screen and no global state. Maps
-are drawn in the world frame, in metres, north up; light falls from the north-west.
+A figure is a file of its own here, with one function that returns a matplotlib figure bound to no
+screen and no global state. Maps are drawn in the world frame, in metres, north up; light falls from
+the north-west. What figures share: `style` for colours and axes, `relief` for the pile under a map,
+`digs` and `truck` for what lies on it, `png` for files.
 """
 
-from wlplan.report.figures.figures import diggability_figure, plan_figure, totals_figure
-from wlplan.report.figures.paper import png_bytes, save_figure
+from wlplan.report.figures.diggability import diggability_figure
+from wlplan.report.figures.plan import plan_figure
+from wlplan.report.figures.png import png_bytes, save_figure
+from wlplan.report.figures.totals import totals_figure
 
 __all__ = ["diggability_figure", "plan_figure", "png_bytes", "save_figure", "totals_figure"]

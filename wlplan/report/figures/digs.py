@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patches import Circle
 
-from wlplan.report.figures.paper import BLUE, PANEL_WIDTH, add_arrow
 from wlplan.report.figures.relief import RISE, height_above_ground
+from wlplan.report.figures.style import BLUE, PANEL_WIDTH, add_arrow
 from wlplan.types import Pile
 
 # Radius of the numbers of the digs, as a part of the longer side of the view.

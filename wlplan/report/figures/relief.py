@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
-from wlplan.report.figures.paper import BLUE, FAINT, INK
+from wlplan.report.figures.style import BLUE, FAINT, INK
 from wlplan.types import Pile
 
 PILE = LinearSegmentedColormap.from_list(
@@ -23,8 +23,7 @@ RISE = 0.15
 # Spacings of contour lines to choose from [m]; the widest that gives at least this many is taken.
 _CONTOUR_STEPS = (2.0, 1.0, 0.5, 0.25, 0.1)
 _LEAST_CONTOURS = 4
-# Ground shown around the pile [m], and how far a truck may stand outside that view, as a part of
-# its side, to be drawn to scale; a truck further away becomes an arrow at the border.
+# Ground shown around the pile [m].
 _MARGIN = 2.0
 
 

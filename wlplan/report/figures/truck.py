@@ -11,8 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
 from wlplan.planning.transport import Receiver
-from wlplan.report.figures.paper import INK, PALE, add_arrow
+from wlplan.report.figures.style import INK, PALE, add_arrow
 
+# How far a truck may stand outside the view of the pile to widen it, as a part of the longer side;
+# one further away becomes an arrow at the border.
 _TRUCK_REACH = 0.75
 # Body of the truck that is drawn [m]: length and width of a small hauler. Only a symbol.
 _TRUCK_SIZE = (7.0, 2.6)

@@ -1,9 +1,6 @@
-"""Paper: colours, figures, axes, arrows, and PNG files."""
+"""How all figures look: colours, sizes, axes, arrows."""
 
 from __future__ import annotations
-
-import io
-import os
 
 import numpy as np
 from jaxtyping import Float
@@ -12,8 +9,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 
-from wlplan.io import write_bytes_atomic
-
 # Colours that people with the common kinds of colour blindness tell apart.
 INK = "#1d2733"
 FAINT = "#6b7785"
@@ -21,31 +16,8 @@ PALE = "#c9ced4"
 BLUE = "#1f5fa8"
 ORANGE = "#d9700a"
 GREEN = "#3a7d44"
-# Width of one map on paper [inch].
+# Width of one map [inch].
 PANEL_WIDTH = 5.6
-
-
-def png_bytes(figure: Figure, *, dpi: int = 150) -> bytes:
-    """A figure as the content of a PNG file."""
-    buffer = io.BytesIO()
-    figure.savefig(
-        buffer,
-        format="png",
-        dpi=dpi,
-        bbox_inches="tight",
-        pad_inches=0.12,
-        metadata={"Software": None},
-    )
-    return buffer.getvalue()
-
-
-def save_figure(path: str | os.PathLike[str], figure: Figure, *, dpi: int = 150) -> None:
-    """Write a figure as PNG, in one piece or not at all.
-
-    Raises:
-        InputError: If the file cannot be written.
-    """
-    write_bytes_atomic(path, png_bytes(figure, dpi=dpi))
 
 
 def new_figure(width: float, height: float) -> Figure:

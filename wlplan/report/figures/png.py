@@ -1,0 +1,43 @@
+"""A figure as a PNG file."""
+
+from __future__ import annotations
+
+import io
+import os
+
+from matplotlib.figure import Figure
+
+from wlplan.io import write_bytes_atomic
+
+
+def png_bytes(figure: Figure, *, dpi: int = 150) -> bytes:
+    """A figure as the content of a PNG file; the same figure gives the same bytes.
+
+    Args:
+        figure: What to draw; its empty borders are cut off.
+        dpi: Pixels an inch.
+    """
+    buffer = io.BytesIO()
+    figure.savefig(
+        buffer,
+        format="png",
+        dpi=dpi,
+        bbox_inches="tight",
+        pad_inches=0.12,
+        metadata={"Software": None},
+    )
+    return buffer.getvalue()
+
+
+def save_figure(path: str | os.PathLike[str], figure: Figure, *, dpi: int = 150) -> None:
+    """Write a figure as PNG, in one piece or not at all.
+
+    Args:
+        path: File to write.
+        figure: What to draw, as for `png_bytes`.
+        dpi: Pixels an inch.
+
+    Raises:
+        InputError: If the file cannot be written.
+    """
+    write_bytes_atomic(path, png_bytes(figure, dpi=dpi))
