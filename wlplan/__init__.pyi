@@ -6,6 +6,7 @@ from .errors import InputError as InputError
 from .io import read_pile as read_pile
 from .io import read_plan as read_plan
 from .io import write_pile as write_pile
+from .io import write_plan as write_plan
 from .planning.objective import OBJECTIVES as OBJECTIVES
 from .planning.objective import Objective as Objective
 from .planning.plan import PlanResult as PlanResult
@@ -13,6 +14,11 @@ from .planning.plan import plan_loads as plan_loads
 from .planning.plan import play as play
 from .planning.rollout import rollout as rollout
 from .planning.transport import Receiver as Receiver
+from .report.figures import diggability_figure as diggability_figure
+from .report.figures import plan_figure as plan_figure
+from .report.figures import save_figure as save_figure
+from .report.figures import totals_figure as totals_figure
+from .report.page import write_report as write_report
 from .site.presets import machine_named as machine_named
 from .site.presets import soil_named as soil_named
 from .studies.diggability import DiggabilityMap as DiggabilityMap

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from wlplan.cli.outputs import print_table, remark, titled_table
 from wlplan.constants import QUANTITIES
+from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error
 
 if TYPE_CHECKING:
     from wlplan.planning.plan import PlanResult
@@ -52,8 +53,6 @@ def ledger_of(pile: Pile, simulated: PlanResult, simulator: Any) -> dict[str, fl
 
 def remark_on_ledger(ledger: Mapping[str, float]) -> None:
     """Tell if volume and mass of a ledger do not agree."""
-    from wlplan.report.page import LEDGER_TOLERANCE, ledger_error
-
     error = ledger_error(ledger)
     if error > LEDGER_TOLERANCE:
         remark(f"the ledger of the simulated pile is off by {100.0 * error:.2g} %")

@@ -1,0 +1,31 @@
+"""Reading a page of HTML as a browser would, for the tests of the report."""
+
+from html.parser import HTMLParser
+
+
+class Page(HTMLParser):
+    """A page whose tags are closed in order: its tags, its words, and what it would load."""
+
+    def __init__(self, source):
+        super().__init__()
+        self._open = []
+        self.tags, self.links, self.text = [], [], ""
+        self.feed(source)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        """Note the tag and what it refers to."""
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("src", "srcset", "href")]
+        if tag not in ("meta", "img", "br", "link"):
+            self._open.append(tag)
+
+    def handle_endtag(self, tag):
+        """The tag that was opened last is closed first."""
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        """Collect words; those of the style sheet are none."""
+        if self._open[-1:] != ["style"]:
+            self.text += data
