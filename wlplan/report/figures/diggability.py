@@ -79,14 +79,13 @@ def _draw_ticks(
     panel: Axes, ticks: Float[np.ndarray, "n 2 2"], shades: Float[np.ndarray, " n"]
 ) -> None:
     """Lines from point to point [m] on a map, coloured by shades from 0 to 1, on white ones."""
-    line = {"capstyle": "round"}
-    panel.add_collection(
-        LineCollection(list(ticks), colors="white", linewidths=4.2, zorder=4, **line)
-    )
     colours = [tuple(colour) for colour in _COLOURS(shades)]
-    panel.add_collection(
-        LineCollection(list(ticks), colors=colours, linewidths=2.8, zorder=5, **line)
-    )
+    for colour, width, zorder in (("white", 4.2, 4), (colours, 2.8, 5)):
+        panel.add_collection(
+            LineCollection(
+                list(ticks), colors=colour, linewidths=width, capstyle="round", zorder=zorder
+            )
+        )
 
 
 def _draw_histogram(
@@ -97,7 +96,7 @@ def _draw_histogram(
     middle = 0.5 * (edges[1:] + edges[:-1])
     panel.bar(middle, count, width=np.diff(edges), color=_COLOURS(scale(middle)), edgecolor="white")
     panel.axvline(float(np.median(values)), color=INK, linewidth=1.0, linestyle=":")
-    panel.yaxis.get_major_locator().set_params(integer=True)
+    panel.locator_params(axis="y", integer=True)
     tidy(panel)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -13,10 +13,10 @@ from wlplan.constants import QUANTITIES, Quantity
 from wlplan.report.figures.style import BLUE, INK, ORANGE, new_figure, tidy
 from wlplan.types import Performance
 
-# Lines of the series, by their labels; those of the simulation have hollow markers.
+# Colour, marker, its filling and line of a series, by its label.
 _LINES = {
-    "predicted": {"color": BLUE, "marker": "o", "linestyle": "-"},
-    "simulated": {"color": ORANGE, "marker": "s", "linestyle": "--", "markerfacecolor": "white"},
+    "predicted": (BLUE, "o", BLUE, "-"),
+    "simulated": (ORANGE, "s", "white", "--"),
 }
 
 
@@ -49,10 +49,10 @@ def _draw_quantity(
     """One quantity of all series, each load in one panel and accumulated in the other."""
     title, unit, _ = quantity
     for label, values in series.items():
-        line = {"markersize": 4.5, "linewidth": 1.4, "label": label, **_LINES[label]}
-        each.plot(np.arange(1, len(values) + 1), values, **line)
+        _draw_series(each, np.arange(1, len(values) + 1), values, label)
         # From nothing before the first loading.
-        total.plot(np.arange(len(values) + 1), np.append(0.0, np.cumsum(values)), **line)
+        summed = np.append(0.0, np.cumsum(values))
+        _draw_series(total, np.arange(len(values) + 1), summed, label)
     each.set_title(f"{title.capitalize()} of each load", color=INK)
     each.set_ylim(0.0, 1.18 * max(each.get_ylim()[1], 1e-3))
     total.set_title(f"{title.capitalize()} accumulated", color=INK)
@@ -74,7 +74,24 @@ def _draw_quantity(
         panel.set_ylabel(f"{title} [{unit}]")
         tidy(panel)
         panel.set_xlim(0.0 if count > 1 else -0.25, count + 0.5)
-        panel.xaxis.get_major_locator().set_params(integer=True)
+        panel.locator_params(axis="x", integer=True)
+
+
+def _draw_series(
+    panel: Axes, load: Int[np.ndarray, " n"], values: Float[np.ndarray, " n"], label: str
+) -> None:
+    colour, marker, filling, line = _LINES[label]
+    panel.plot(
+        load,
+        values,
+        color=colour,
+        marker=marker,
+        markerfacecolor=filling,
+        markersize=4.5,
+        linestyle=line,
+        linewidth=1.4,
+        label=label,
+    )
 
 
 def _sum_text(sums: list[float], unit: str) -> str:
