@@ -22,7 +22,7 @@ from wlplan.planning.transport import default_receiver
 from wlplan.report.figures import png_bytes
 from wlplan.studies.gradcheck import as_table, cost_and_gradient, differentiable
 from wlplan.types import LoadingPlan
-from wlplan.xla import EachRow
+from wlplan.xla import ParallelMap
 
 # A cone that holds twice what 100 loadings take: a bucket that comes back empty from the last of a
 # pile has a large gradient of its own.
@@ -34,7 +34,7 @@ MEMORY_LIMIT = 2 * 2**30
 # A change of a component that is about as much as any other [m, m, rad, then of the action].
 UNITS = (1.0, 1.0, 0.1, *(0.1 * (np.asarray(ACTION_HIGH) - np.asarray(ACTION_LOW))))
 
-_gradients = EachRow(cost_and_gradient)
+_gradients = ParallelMap(cost_and_gradient)
 
 
 def run(preset: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What XLA has to be helped with: several rollouts side by side, and results that are kept.
+"""Where XLA needs help: maps run in parallel on the cores, and arrays that are materialized.
 
 A CPU gains nothing from a batch of rollouts, which only takes longer to compile and waits for its
 slowest member; but each of its cores can run one.
@@ -21,13 +21,13 @@ from jaxtyping import Array, Bool, Float
 from wlplan.types import PyTree
 
 
-class EachRow:
-    """`function(shared, row)` for several rows: pytrees whose leaves have one more leading axis.
+class ParallelMap:
+    """A compiled `function(shared, row)`, mapped over rows in parallel.
 
-    On a CPU the rows are shared out among its cores, elsewhere they are one `vmap`.
+    On a CPU each core takes one row at a time, elsewhere the rows are one `vmap`.
 
     Args:
-        function: Pure function of what the rows share and of one row.
+        function: Pure function of two pytrees: what all rows share, and one row.
     """
 
     def __init__(self, function: Callable[[Any, Any], Any]):
@@ -36,7 +36,15 @@ class EachRow:
         self._ran: set[Any] = set()
 
     def __call__(self, shared: Any, rows: Any) -> Any:
-        """The results, leaves with the leading axis of the rows."""
+        """The results of all rows.
+
+        Args:
+            shared: Pytree that every call of the function gets.
+            rows: Pytree whose leaves have a leading axis `n`, one entry a row.
+
+        Returns:
+            Pytree of the function's results, leaves with the same leading axis `n`.
+        """
         if jax.default_backend() != "cpu":
             return self._batch(shared, rows)
         count = len(jax.tree.leaves(rows)[0])
@@ -59,17 +67,17 @@ class EachRow:
         return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *results)
 
 
-def stored(values: PyTree, wanted: Bool[Array, ""], *, otherwise: float = 0.0) -> PyTree:
-    """Arrays as they are, or filled with a number where they are not wanted.
+def materialize_if(values: PyTree, wanted: Bool[Array, ""], *, otherwise: float = 0.0) -> PyTree:
+    """Have XLA store arrays instead of computing them anew in each operation that uses them.
 
-    On a CPU XLA computes an array anew in each operation that uses it, and for each element of a
-    larger array that it is part of. A branch makes it store the array. On other devices, where a
-    branch costs more than it saves, nothing is done.
+    On a CPU XLA fuses an array into all its uses, and computes it for each element of a larger
+    array that it is part of. A branch stops that. On other devices, where a branch costs more than
+    it saves, the values are returned unchanged, whether wanted or not.
 
     Args:
-        values: Pytree of arrays.
-        wanted: Must not be known when compiling.
-        otherwise: The number.
+        values: Pytree of arrays of any shapes.
+        wanted: Whether the values are needed; must not be known at compile time.
+        otherwise: What the arrays are filled with, on a CPU, if they are not wanted.
     """
     if jax.default_backend() != "cpu":
         return values
@@ -80,15 +88,16 @@ def stored(values: PyTree, wanted: Bool[Array, ""], *, otherwise: float = 0.0) -
     return lax.cond(wanted, lambda values: values, unwanted, values)
 
 
-def kept(values: PyTree, source: Float[Array, ""]) -> PyTree:
-    """`stored` for arrays that are wanted unless a number they come from is NaN; then so are they.
+def materialize(values: PyTree, source: Float[Array, ""]) -> PyTree:
+    """`materialize_if` for arrays that are always needed.
 
     Args:
-        values: Pytree of arrays.
-        source: For instance one of the heights; not of a single member of a batch, since a branch
-            that differs among members is no branch.
+        values: Pytree of arrays of any shapes.
+        source: A number that the values are computed from, for instance one of the heights: XLA
+            cannot know it at compile time. If it is NaN the values become NaN too. It must be
+            shared by all members of a batch: a branch that differs among them is no branch.
     """
-    return stored(values, source == source, otherwise=float("nan"))
+    return materialize_if(values, source == source, otherwise=float("nan"))
 
 
 def floats(values: np.ndarray) -> Array:

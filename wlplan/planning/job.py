@@ -17,7 +17,7 @@ from wlplan.planning.poses import Toe, pose_at
 from wlplan.planning.rollout import closed_loop
 from wlplan.planning.transport import Receiver, transport
 from wlplan.types import Action, LoadingPlan, Pile, Pose, Rollout, World, action_from
-from wlplan.xla import EachRow
+from wlplan.xla import ParallelMap
 
 
 @no_type_check
@@ -133,10 +133,10 @@ def stacked(decisions: Sequence[Decisions]) -> Decisions:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *decisions)
 
 
-outcomes = EachRow(play_decisions)
+outcomes = ParallelMap(play_decisions)
 """`outcomes(job, plans)` plays several plans; leaves [K, N]."""
 
-played = EachRow(play_plan)
+played = ParallelMap(play_plan)
 """`played(job, plans)` plays several fixed plans; leaves [K, N]."""
 
 
@@ -144,5 +144,5 @@ def _cost_and_gradient(job: ToeJob, plan: Decisions) -> tuple[Float[Array, ""], 
     return jax.value_and_grad(lambda decisions: play_decisions(job, decisions).cost)(plan)
 
 
-costs_and_gradients = EachRow(_cost_and_gradient)
+costs_and_gradients = ParallelMap(_cost_and_gradient)
 """`costs_and_gradients(job, plans)`: cost of several plans, leaves [K, N], and its gradient."""

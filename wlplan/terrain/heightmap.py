@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from wlplan.constants import CELL_SIZE
 from wlplan.types import LocalHeightmap, Pile, Pose
-from wlplan.xla import kept
+from wlplan.xla import materialize
 
 # Paper, section 6.3: 3.6 m for the performance predictor, which leaves 0.5 m on either side of the
 # bucket; 5.2 m displaced by 1.0 m towards the approach for the pile state predictor.
@@ -97,7 +97,7 @@ def sample_local(
         displacement: How far the map begins before the dig location [m].
     """
     points = local_points(pose, cells, displacement, pile.height.dtype)
-    height = kept(sample(pile.height, pile, *points), pile.height[0, 0])
+    height = materialize(sample(pile.height, pile, *points), pile.height[0, 0])
     first = sample(pile.height, pile, *to_world(pose, jnp.asarray(-displacement), jnp.asarray(0.0)))
     return LocalHeightmap(height - first, CELL_SIZE, displacement)
 
@@ -176,7 +176,7 @@ def add_local_change(
         jnp.abs(along - (n - 1) / 2 * CELL_SIZE + displacement) < (n + 1) / 2 * CELL_SIZE
     )
     on_grid = jnp.where(inside, sample(padded, frame, along, left), 0.0)
-    on_grid = kept(on_grid, change[0, 0])
+    on_grid = materialize(on_grid, change[0, 0])
     surface = lax.dynamic_slice(height, start, on_grid.shape)
     available = jnp.maximum(surface - near.floor, 0.0)
     area_ratio = (CELL_SIZE / window.cell_size) ** 2

@@ -34,7 +34,7 @@ from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, Soil
 from wlplan.terrain.heightmap import STATE_DISPLACEMENT
 from wlplan.types import Action
-from wlplan.xla import stored
+from wlplan.xla import materialize_if
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,7 +205,7 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     soil_force = terrain.reaction(
         machine, soil, state.height, state.ground, state.fill, bucket, wanted
     )
-    soil_force = stored(soil_force, wanted)
+    soil_force = materialize_if(soil_force, wanted)
     vertical = soil_force.vertical
 
     # Vehicle: thrust while filling, brake after the stop. The soil can stop it, not push it back.

@@ -29,7 +29,7 @@ from wlplan.site.soil import Soil
 from wlplan.terrain.automaton import FLOW_FRACTION
 from wlplan.terrain.automaton.neighbours import NEIGHBOURS
 from wlplan.terrain.heightmap import STATE_CELLS, STATE_DISPLACEMENT, local_axes
-from wlplan.xla import stored
+from wlplan.xla import materialize_if
 
 _ALONG, _LEFT = local_axes(STATE_CELLS, STATE_DISPLACEMENT)
 _CELL_AREA = CELL_SIZE**2
@@ -179,7 +179,7 @@ def reaction(
     met = lanes.of(height)
     near = _read(met, bucket.x + _AHEAD)
     far = _read(met, bucket.x + _AHEAD + _SLOPE_LENGTH)
-    near, far = stored((near, far), wanted)
+    near, far = materialize_if((near, far), wanted)
     depth = jnp.maximum(near - bucket.z[None], 0.0)
     slope = jnp.clip(jnp.arctan((far - near) / _SLOPE_LENGTH), _LEAST_SLOPE, _GREATEST_SLOPE)
     # Soil in a lane covers the floor that would cut.
@@ -187,7 +187,7 @@ def reaction(
     rake = jnp.clip(bucket.tilt[None] + slope, _LEAST_RAKE, _GREATEST_RAKE)
     pressed = bucket.tilt + soil.steel_friction
     wedge = wedge_of(depth * jnp.cos(slope), rake, slope, soil.steel_friction, soil=soil)
-    wedge, bare, depth = stored((wedge, bare, depth), wanted)
+    wedge, bare, depth = materialize_if((wedge, bare, depth), wanted)
     cutting = total(width * bare * least_resistance(wedge, soil=soil))
     edge = soil.edge_resistance * total(width * jnp.clip(depth / _EDGE_DEPTH, 0.0, 1.0))
 
@@ -305,7 +305,7 @@ def move(
     share = step / _SLIDE_TIME
     over = share * _over_the_sides(fill, lanes.width, machine)
     along_sides = inside / jnp.maximum(total(inside[1:-1]), 1e-6)[None]
-    bucket, open_part, passed, inside, laid, along_sides, over = stored(
+    bucket, open_part, passed, inside, laid, along_sides, over = materialize_if(
         (bucket, open_part, passed, inside, laid, along_sides, over), wanted
     )
     cut = (
@@ -315,7 +315,7 @@ def move(
     )
     swept = total(lanes.of(cut)) * _CELL_AREA
     pushed = (1.0 - open_part) * swept
-    swept, pushed = stored((swept, pushed), wanted)
+    swept, pushed = materialize_if((swept, pushed), wanted)
     aside = jnp.asarray(_aside(lanes), dtype) @ (pushed / _CELL_AREA)
     height = (
         height
@@ -330,7 +330,7 @@ def move(
     mouth = _read(lanes.of(height), bucket.x + _AHEAD)
     z = bucket.z[None]
     level = jnp.minimum(mouth, z + (1.0 - open_part) * jnp.maximum(mouth - z, 0.0))
-    level = stored(level, wanted)
+    level = materialize_if(level, wanted)
     occupied = inside[:, None] * lane
     surface = height + occupied * (jnp.maximum(lanes.spread(level)[None], height) - height)
     # A layer thinner than a cell gives in proportion, so none gives what it does not have.

@@ -29,7 +29,7 @@ from wlplan.planning.job import (
     unsquash,
 )
 from wlplan.types import Pile
-from wlplan.xla import EachRow
+from wlplan.xla import ParallelMap
 
 Progress = Callable[[str, int, int, float | None], None]
 """`progress(stage, done, total, cost)`, called as a planner advances."""
@@ -71,7 +71,7 @@ def _costs_at_poses(
     return jax.vmap(at_pose)(poses)
 
 
-_costs_of_portions = EachRow(_costs_at_poses)
+_costs_of_portions = ParallelMap(_costs_at_poses)
 
 
 def _candidate_costs(

@@ -14,7 +14,7 @@ from wlplan.site.soil import GRAVEL
 from wlplan.terrain.automaton.neighbours import BITS, NEIGHBOURS, links_of, neighbour, rim
 from wlplan.terrain.automaton.slopes import movable, steeper_than
 from wlplan.types import Pile
-from wlplan.xla import kept
+from wlplan.xla import materialize
 
 # Part of the excess height that an edge moves in one sweep; 1 / (number of neighbours) is the
 # largest value at which a sweep is non-expansive.
@@ -137,7 +137,7 @@ def _sweep_on(
 ) -> tuple[tuple[Array, Array], Array]:
     """Surface with its rim and velocity after one more sweep, and how much velocity was kept."""
     rimmed, velocity = state
-    flow = kept(-FLOW_FRACTION * _outflow(rimmed, drop, links), rimmed[0, 0])
+    flow = materialize(-FLOW_FRACTION * _outflow(rimmed, drop, links), rimmed[0, 0])
     uphill = jnp.vdot(flow, velocity) < 0.0
     part = jnp.where(uphill, jnp.zeros((), flow.dtype), jnp.asarray(momentum, flow.dtype))
     velocity = part * velocity + flow

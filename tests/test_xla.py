@@ -1,4 +1,4 @@
-"""Several rollouts side by side: the same as one after the other."""
+"""Rows mapped in parallel are as one after the other, and a materialized array is as it was."""
 
 import os
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan.xla import EachRow, cores, kept, stored
+from wlplan.xla import ParallelMap, cores, materialize, materialize_if
 
 
 def shifted(shared, row):
@@ -27,7 +27,7 @@ def rows(count, dtype=np.float32):
 def test_rows_are_as_in_a_batch_and_in_their_order(count):
     shared = jnp.asarray([1.0, 2.0, -3.0])
     many = rows(count)
-    each = EachRow(shifted)
+    each = ParallelMap(shifted)
     for _ in range(2):
         got = each(shared, many)
         expected = jax.vmap(shifted, in_axes=(None, 0))(shared, many)
@@ -38,14 +38,14 @@ def test_rows_are_as_in_a_batch_and_in_their_order(count):
 
 def test_rows_keep_their_precision():
     with jax.enable_x64(True):
-        got = EachRow(shifted)(jnp.ones(3), rows(4, np.float64))
+        got = ParallelMap(shifted)(jnp.ones(3), rows(4, np.float64))
         assert got["sum"].dtype == np.float64
         expected = jax.vmap(shifted, in_axes=(None, 0))(jnp.ones(3), rows(4, np.float64))
         np.testing.assert_allclose(got["sum"], expected["sum"], rtol=1e-14)
 
 
 def test_other_shapes_are_compiled_anew():
-    each = EachRow(lambda shared, row: (shared * row).sum())
+    each = ParallelMap(lambda shared, row: (shared * row).sum())
     np.testing.assert_allclose(each(jnp.float32(2.0), jnp.ones((2, 3))), [6.0, 6.0])
     np.testing.assert_allclose(each(jnp.float32(2.0), jnp.ones((2, 5))), [10.0, 10.0])
 
@@ -55,25 +55,25 @@ def test_an_error_in_a_row_reaches_the_caller():
         raise ValueError("no such row")
 
     with pytest.raises(ValueError, match="no such row"):
-        EachRow(refuses)(jnp.zeros(1), jnp.zeros((3, 2)))
+        ParallelMap(refuses)(jnp.zeros(1), jnp.zeros((3, 2)))
 
 
-def test_what_is_kept_is_what_it_was():
+def test_what_is_materialized_is_what_it_was():
     values = {"a": jnp.arange(3.0), "b": jnp.ones((2, 2))}
-    through = jax.jit(lambda values, source: kept(values, source))
+    through = jax.jit(lambda values, source: materialize(values, source))
     jax.tree.map(np.testing.assert_array_equal, through(values, jnp.float32(0.0)), values)
-    gradient = jax.grad(lambda a: (kept(a**2, a[0])).sum())(jnp.arange(3.0))
+    gradient = jax.grad(lambda a: (materialize(a**2, a[0])).sum())(jnp.arange(3.0))
     np.testing.assert_array_equal(gradient, 2.0 * np.arange(3.0))
 
 
 def test_what_comes_from_nan_is_nan():
     """Not zero: that would hide it."""
-    found = jax.jit(lambda x: kept(jnp.ones(3), x))(jnp.float32(np.nan))
+    found = jax.jit(lambda x: materialize(jnp.ones(3), x))(jnp.float32(np.nan))
     assert np.isnan(found).all() or jax.default_backend() != "cpu"
 
 
 def test_what_is_not_wanted_is_filled():
-    fill = jax.jit(lambda wanted: stored(jnp.ones(2), wanted, otherwise=5.0))
+    fill = jax.jit(lambda wanted: materialize_if(jnp.ones(2), wanted, otherwise=5.0))
     np.testing.assert_array_equal(fill(jnp.array(True)), [1.0, 1.0])
     if jax.default_backend() == "cpu":
         np.testing.assert_array_equal(fill(jnp.array(False)), [5.0, 5.0])
