@@ -51,7 +51,7 @@ def dug_cone(shape=(96, 96)):
 def test_sweeps_and_settling_keep_the_volume(seed):
     height = rough(seed)
     assert_volume_kept(height, sweeps(height, DROP, None, 100))
-    assert_volume_kept(height, settle(Pile(height, 0.1)).height)
+    assert_volume_kept(height, settle(Pile(height, 0.1)).pile.height)
 
 
 def test_a_sweep_moves_one_edge_by_hand():
@@ -69,22 +69,22 @@ def test_a_settled_pile_stays_settled():
     gentle = jnp.asarray(np.maximum(1.0 - 0.04 * np.hypot(x - 24, y - 20), 0.0) + noise)
     pile = Pile(gentle.astype(jnp.float32), 0.1)
     assert steepest_slope(pile) < REPOSE
-    np.testing.assert_array_equal(settle(pile).height, pile.height)
+    np.testing.assert_array_equal(settle(pile).pile.height, pile.height)
     np.testing.assert_array_equal(relax(pile).height, pile.height)
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
 def test_rotating_commutes_with_settling(turns):
     height = rough(shape=(48, 48))
-    straight = settle(Pile(height, 0.1)).height
-    turned = settle(Pile(jnp.rot90(height, turns), 0.1)).height
+    straight = settle(Pile(height, 0.1)).pile.height
+    turned = settle(Pile(jnp.rot90(height, turns), 0.1)).pile.height
     np.testing.assert_allclose(jnp.rot90(straight, turns), turned, atol=1e-6)
 
 
 def test_reflecting_commutes_with_settling():
     height = rough(shape=(48, 48))
-    straight = settle(Pile(height, 0.1)).height
-    reflected = settle(Pile(height[:, ::-1], 0.1)).height
+    straight = settle(Pile(height, 0.1)).pile.height
+    reflected = settle(Pile(height[:, ::-1], 0.1)).pile.height
     np.testing.assert_allclose(straight[:, ::-1], reflected, atol=1e-6)
 
 
@@ -110,7 +110,7 @@ def test_a_batch_equals_its_members():
     heights = jnp.stack([rough(seed) for seed in range(3)])
 
     def run(height):
-        return settle(Pile(height, 0.1)).height
+        return settle(Pile(height, 0.1)).pile.height
 
     np.testing.assert_allclose(jax.vmap(run)(heights), [run(h) for h in heights], atol=2e-6)
     gradient = jax.grad(lambda height: (run(height) ** 2).sum())
@@ -142,7 +142,7 @@ def test_after_a_load_no_slope_anywhere_is_more_than_a_degree_too_steep(digs):
 def test_a_load_leaves_the_volume_and_the_ground(digs):
     settled = jax.jit(settle)
     for dig in digs[::5]:
-        assert_volume_kept(dig.dug.height, settled(dig.dug).height)
+        assert_volume_kept(dig.dug.height, settled(dig.dug).pile.height)
         hole = jax.lax.dynamic_update_slice(dig.pile.height, dig.dug.height, dig.start)
         assert_volume_kept(hole, dig.after.height)
         assert dig.after.height.min() >= 0.0
@@ -153,7 +153,7 @@ def test_settling_a_dig_is_close_to_the_converged_automaton(digs):
     """Within 2 cm on average over the disturbed area."""
     settled, reference = jax.jit(settle), jax.jit(converged)
     for dig in digs[:: 100 // 12]:
-        fast, slow = settled(dig.dug).height, reference(dig.dug).height
+        fast, slow = settled(dig.dug).pile.height, reference(dig.dug).height
         changes = [jnp.abs(h - dig.dug.height) for h in (dig.before.height, fast, slow)]
         disturbed = jnp.max(jnp.stack(changes), axis=0) > 1e-3
         assert jnp.abs(fast - slow)[disturbed].mean() <= 0.02
@@ -166,10 +166,10 @@ def test_an_avalanche_that_leaves_the_window_goes_on_beyond():
     pile = Pile(jnp.asarray(height, jnp.float32), 0.1)
     pose = Pose(*(jnp.float32(v) for v in (3.0, 6.0, 0.0)))
     window, start = window_of(pile, pose)
-    dug, _ = excavate(window, pose, jnp.float32(3.0), width=WA320.bucket_width)
-    alone = jax.lax.dynamic_update_slice(pile.height, settle(dug).height, start)
+    dug = excavate(window, pose, jnp.float32(3.0), width=WA320.bucket_width).pile
+    alone = jax.lax.dynamic_update_slice(pile.height, settle(dug).pile.height, start)
     assert math.degrees(steepest_slope(pile.replace(height=alone))) > 33.0
-    after = settle_dug(pile, dug.height, start)
+    after = settle_dug(pile, dug.height, start).pile
     assert math.degrees(steepest_slope(after)) <= 33.0 + 1e-3
     end = int(start[0]) + window.height.shape[0]
     assert (after.height != pile.height)[end:].any()
@@ -179,7 +179,7 @@ def test_an_avalanche_that_leaves_the_window_goes_on_beyond():
 def test_a_tighter_tolerance_is_met():
     for degrees in (0.2, 0.5, 3.0):
         schedule = Schedule(tolerance=math.radians(degrees), most_rounds=50)
-        settled = settle(Pile(dug_cone(), 0.1), schedule=schedule)
+        settled = settle(Pile(dug_cone(), 0.1), schedule=schedule).pile
         assert math.degrees(steepest_slope(settled)) <= 32.0 + degrees + 1e-3
 
 
@@ -214,7 +214,7 @@ def test_nothing_slides_below_an_uneven_floor_or_into_unseen_cells():
 
 def test_any_size_of_grid_can_be_settled():
     pile = Pile(rough(shape=(47, 41)), 0.1)
-    settled = settle(pile)
+    settled = settle(pile).pile
     assert settled.height.shape == (47, 41)
     assert_volume_kept(pile.height, settled.height)
 
@@ -274,9 +274,9 @@ def test_gradient_of_settling_against_finite_differences_with_mask_and_floor():
         weight = jnp.asarray(rng.normal(size=pile.height.shape))
 
         def cost(h):
-            return (weight * settle(pile.replace(height=h), repose_angle=REPOSE).height).sum()
+            return (weight * settle(pile.replace(height=h), repose_angle=REPOSE).pile.height).sum()
 
-        assert jnp.abs(settle(pile).height - pile.height).max() > 0.1
+        assert jnp.abs(settle(pile).pile.height - pile.height).max() > 0.1
         assert_gradient(cost, pile.height, relative=1e-5, skip=8)
 
 
@@ -292,16 +292,16 @@ def test_gradient_through_several_windows_against_finite_differences():
         weight = jnp.asarray(rng.normal(size=height.shape))
 
         def cost(h):
-            return (weight * settle_dug(pile, h, start).height).sum()
+            return (weight * settle_dug(pile, h, start).pile.height).sum()
 
-        moved = settle_dug(pile, dug, start).height != pile.height
+        moved = settle_dug(pile, dug, start).pile.height != pile.height
         assert moved[10:].any(), "the avalanche stays in its first window"
         assert_gradient(cost, dug, relative=1e-5, skip=8)
 
 
 def test_cells_outside_the_avalanche_keep_their_cotangent():
     pile = uneven(np.random.default_rng(5), shape=(24, 22))
-    gradient = jax.grad(lambda h: settle(pile.replace(height=h)).height.sum())(pile.height)
+    gradient = jax.grad(lambda h: settle(pile.replace(height=h)).pile.height.sum())(pile.height)
     # The volume is kept, whatever slides.
     np.testing.assert_allclose(gradient, 1.0, atol=1e-5)
 
@@ -309,7 +309,7 @@ def test_cells_outside_the_avalanche_keep_their_cotangent():
 def test_forward_mode_says_that_it_is_not_available():
     height = rough(shape=(8, 8))
     with pytest.raises(TypeError, match="forward-mode"):
-        jax.jvp(lambda h: settle(Pile(h, 0.1)).height, (height,), (jnp.ones_like(height),))
+        jax.jvp(lambda h: settle(Pile(h, 0.1)).pile.height, (height,), (jnp.ones_like(height),))
 
 
 def test_memory_of_the_gradient_does_not_grow_with_the_sweeps():
@@ -337,5 +337,5 @@ def test_gradient_stays_bounded_over_many_sweeps():
 
 def test_gradient_is_finite_on_flat_ground():
     for height in (jnp.zeros((16, 16)), jnp.full((16, 16), 2.0)):
-        gradient = jax.grad(lambda h: (settle(Pile(h, 0.1)).height ** 2).sum())(height)
+        gradient = jax.grad(lambda h: (settle(Pile(h, 0.1)).pile.height ** 2).sum())(height)
         assert jnp.isfinite(gradient).all()

@@ -29,7 +29,7 @@ def pose(x=3.0, y=5.0, heading=0.0, dtype=jnp.float32):
 @pytest.mark.parametrize("volume", [0.3, 1.7, 3.0])
 def test_exactly_the_volume_is_taken(heading, volume):
     pile = slope_pile()
-    after, taken = excavate(pile, pose(heading=heading), jnp.asarray(volume), width=WIDTH)
+    after, taken, _ = excavate(pile, pose(heading=heading), jnp.asarray(volume), width=WIDTH)
     assert float(taken) == pytest.approx(volume, rel=1e-6)
     lost = np.asarray(pile.height - after.height, np.float64).sum() * 0.01
     assert lost == pytest.approx(volume, rel=1e-5)
@@ -38,7 +38,7 @@ def test_exactly_the_volume_is_taken(heading, volume):
 
 def test_only_the_strip_is_dug():
     pile, p = slope_pile(), pose(heading=0.3)
-    after, _ = excavate(pile, p, jnp.asarray(2.0), width=WIDTH)
+    after, *_ = excavate(pile, p, jnp.asarray(2.0), width=WIDTH)
     along, left = to_local(p, *cell_centres(pile))
     dug = pile.height - after.height > 1e-7
     assert not (dug & ((jnp.abs(left) > WIDTH / 2 + 0.06) | (along < -0.06))).any()
@@ -47,7 +47,7 @@ def test_only_the_strip_is_dug():
 
 def test_a_load_larger_than_the_strip_takes_what_is_there():
     pile = slope_pile()
-    after, taken = excavate(pile, pose(), jnp.asarray(50.0), width=WIDTH)
+    after, taken, _ = excavate(pile, pose(), jnp.asarray(50.0), width=WIDTH)
     lost = np.asarray(pile.height - after.height, np.float64).sum() * 0.01
     # A wedge of 30 degrees as long as the strip.
     assert float(taken) == pytest.approx(
@@ -64,7 +64,7 @@ def test_a_thin_layer_gives_what_was_taken(cell, part):
     pile = Pile(jnp.full((cells, cells), 0.05), cell)
     volume = part * 0.05 * STRIP_LENGTH * WIDTH
     for x in np.linspace(2.0, 2.2, 7):
-        after, taken = excavate(pile, pose(x, 5.0, 0.1), jnp.asarray(volume), width=WIDTH)
+        after, taken, _ = excavate(pile, pose(x, 5.0, 0.1), jnp.asarray(volume), width=WIDTH)
         lost = np.asarray(pile.height - after.height, np.float64).sum() * cell**2
         assert lost == pytest.approx(float(taken), rel=1e-4)
         assert float(taken) == pytest.approx(volume / max(part, 1.0), rel=1e-2)
@@ -75,7 +75,7 @@ def test_off_the_pile_nothing_is_taken_and_gradients_are_finite(where):
     pile = Pile(jnp.zeros((60, 60)), 0.1)
 
     def taken(p):
-        after, volume = excavate(pile, p, jnp.asarray(2.0), width=WIDTH)
+        after, volume, _ = excavate(pile, p, jnp.asarray(2.0), width=WIDTH)
         return volume + (after.height**2).sum()
 
     assert float(taken(pose(*where))) == 0.0
@@ -87,7 +87,7 @@ def test_the_floor_and_unseen_cells_are_not_dug():
     ground = 0.5 * pile.height
     valid = jnp.ones(pile.height.shape, bool).at[:, :48].set(False)
     pile = pile.replace(ground=ground, valid=valid)
-    after, taken = excavate(pile, pose(), jnp.asarray(1.0), width=WIDTH)
+    after, taken, _ = excavate(pile, pose(), jnp.asarray(1.0), width=WIDTH)
     assert float(taken) == pytest.approx(1.0, rel=1e-6)
     assert (after.height - ground).min() >= -1e-6
     np.testing.assert_array_equal(after.height[:, :48], pile.height[:, :48])
@@ -104,7 +104,7 @@ def test_the_gradient_in_pose_and_volume_agrees_with_finite_differences():
 
         def cost(inputs):
             p, volume = inputs
-            after, taken = excavate(pile, p, volume, width=WIDTH)
+            after, taken, _ = excavate(pile, p, volume, width=WIDTH)
             return (weight * after.height).sum() + taken
 
         point = (pose(3.013, 5.027, 0.21, jnp.float64), jnp.asarray(1.9))

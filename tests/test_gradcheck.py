@@ -14,9 +14,7 @@ from wlplan import cli, io
 from wlplan.constants import ACTION_HIGH
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
-from wlplan.planning.job import Job
-from wlplan.planning.objective import OBJECTIVES
-from wlplan.planning.transport import default_receiver
+from wlplan.planning.job import make_job
 from wlplan.studies import gradcheck
 from wlplan.studies.gradcheck import COMPONENTS, as_table, check_gradient, plan_from, random_plan
 from wlplan.terrain.seed_piles import seed_pile
@@ -68,7 +66,7 @@ def check(pile):
     """Compare a plan of two loads in the world with the given flaws."""
 
     def run(plan=None, step=gradcheck.STEP, **flaws):
-        job = Job(SmoothWorld(**flaws), pile, default_receiver(pile), OBJECTIVES["efficiency"])
+        job = make_job(SmoothWorld(**flaws), pile)
         plan = random_plan(pile, 2, seed=0) if plan is None else plan
         return check_gradient(job, plan, step=step)
 
@@ -185,7 +183,7 @@ def test_a_gradient_that_is_not_finite_is_wrong(check):
 
 
 def test_it_refuses_what_makes_no_sense(check, pile):
-    job = Job(SmoothWorld(), pile, default_receiver(pile), OBJECTIVES["efficiency"])
+    job = make_job(SmoothWorld(), pile)
     plan = random_plan(pile, 1, seed=0)
     with pytest.raises(InputError, match="step"):
         check_gradient(job, plan, step=0.0)
@@ -196,7 +194,7 @@ def test_it_refuses_what_makes_no_sense(check, pile):
 
 
 def test_progress_reaches_the_end(pile):
-    job = Job(SmoothWorld(error=0.1), pile, default_receiver(pile), OBJECTIVES["efficiency"])
+    job = make_job(SmoothWorld(error=0.1), pile)
     told = []
     check_gradient(job, random_plan(pile, 2, seed=0), progress=lambda *both: told.append(both))
     assert told[0] == (0, 14)

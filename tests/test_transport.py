@@ -12,13 +12,12 @@ from wlplan.constants import GRAVITY
 from wlplan.planning.transport import (
     DUMP_TIME,
     SHIFT_TIME,
-    TURNING_RADIUS,
-    Receiver,
-    default_receiver,
     transport,
     v_turn_length,
 )
 from wlplan.site.machine import WA320
+from wlplan.site.receiver import Receiver, default_receiver
+from wlplan.site.site import Site
 from wlplan.types import Pile, Pose
 
 # The follow-up's receiver for a pile whose toe is at the origin.
@@ -32,13 +31,13 @@ def of(cls, values):
 
 @jax.jit
 def length_of(pose, receiver):
-    return v_turn_length(of(Pose, pose), of(Receiver, receiver))
+    return v_turn_length(of(Pose, pose), of(Receiver, receiver), machine=WA320)
 
 
 @jax.jit
 @jax.grad
 def gradient_of_length(places):
-    return v_turn_length(of(Pose, places[:3]), of(Receiver, places[3:]))
+    return v_turn_length(of(Pose, places[:3]), of(Receiver, places[3:]), machine=WA320)
 
 
 def length(pose, receiver):
@@ -46,12 +45,9 @@ def length(pose, receiver):
 
 
 def drive(pose, receiver, mass, machine=WA320):
-    return tuple(
-        float(v)
-        for v in transport(
-            of(Pose, pose), of(Receiver, receiver), jnp.asarray(mass), machine=machine
-        )
-    )
+    site = Site(machine=machine, receiver=of(Receiver, receiver))
+    way = transport(of(Pose, pose), jnp.asarray(mass), site)
+    return float(way.time), float(way.work)
 
 
 def moved(place, angle, dx, dy):
@@ -85,7 +81,7 @@ def test_straight_behind_it_is_there_and_back():
     receiver = (-WA320.approach_distance - distance, 0.0, 0.0)
     # At least the way itself and the shortest forward leg, and no more than a wide turn over that.
     way = length(HEAD_ON, receiver)
-    assert distance <= way <= distance + 2 * math.pi * TURNING_RADIUS
+    assert distance <= way <= distance + 2 * math.pi * WA320.turning_radius
 
 
 def test_time_and_work_by_hand():
@@ -139,8 +135,8 @@ def test_gradient_against_finite_differences():
     with jax.enable_x64(True):
 
         def one(p):
-            time, work = transport(of(Pose, p[:3]), of(Receiver, p[3:6]), p[6])
-            return time + work / 10.0
+            way = transport(of(Pose, p[:3]), p[6], Site(receiver=of(Receiver, p[3:6])))
+            return way.time + way.work / 10.0
 
         places = [[*pose, *receiver, 3.0] for pose, receiver in (*cases(4), (HEAD_ON, FOLLOW_UP))]
         assert_gradient(lambda p: jax.vmap(one)(p).sum(), jnp.asarray(np.array(places)))

@@ -7,13 +7,17 @@ from .io import read_pile as read_pile
 from .io import read_plan as read_plan
 from .io import write_pile as write_pile
 from .io import write_plan as write_plan
-from .planning.objective import OBJECTIVES as OBJECTIVES
+from .planning import planners as planners
+from .planning.job import Job as Job
+from .planning.job import PlanResult as PlanResult
+from .planning.loading import Loading as Loading
+from .planning.objective import Constraint as Constraint
 from .planning.objective import Objective as Objective
-from .planning.plan import PlanResult as PlanResult
+from .planning.objectives import OBJECTIVES as OBJECTIVES
 from .planning.plan import plan_loads as plan_loads
 from .planning.plan import play as play
+from .planning.proposals import Proposals as Proposals
 from .planning.rollout import rollout as rollout
-from .planning.transport import Receiver as Receiver
 from .report.figures import diggability_figure as diggability_figure
 from .report.figures import plan_figure as plan_figure
 from .report.figures import save_figure as save_figure
@@ -21,6 +25,8 @@ from .report.figures import totals_figure as totals_figure
 from .report.page import write_report as write_report
 from .site.presets import machine_named as machine_named
 from .site.presets import soil_named as soil_named
+from .site.receiver import Receiver as Receiver
+from .site.site import Site as Site
 from .studies.diggability import DiggabilityMap as DiggabilityMap
 from .studies.diggability import diggability_map as diggability_map
 from .terrain.automaton import relax as relax
@@ -35,6 +41,8 @@ from .types import Pile as Pile
 from .types import Pose as Pose
 from .types import Rollout as Rollout
 from .types import World as World
+from .worlds.capabilities import world as world
+from .worlds.learned import LearnedWorld as LearnedWorld
 from .worlds.library import load_world as load_world
 
 __version__: str

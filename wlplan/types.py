@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, no_type_check
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 # JAX rebuilds pytrees with tracers, shapes or None inside, so these classes opt out of runtime
 # shape checking; the functions that take them are checked.
@@ -163,6 +163,20 @@ class LocalHeightmap(struct.PyTreeNode):
     height: Float[Array, "*batch n n"]  # [m]
     cell_size: float = struct.field(pytree_node=False)  # [m]
     displacement: float = struct.field(pytree_node=False)  # delta, towards the approach [m]
+
+
+@no_type_check
+class SolveReport(struct.PyTreeNode):
+    """How the solvers of a loading ended; every leaf is a scalar, or has the loadings as its axis.
+
+    A world that solves for the pile after a loading tells it by `solve(pile, pose, action) ->
+    (pile_after, performance, report)`, the first two as by calling it.
+    """
+
+    rounds: Int[Array, "*n"]  # that the automaton made
+    settled: Bool[Array, "*n"]  # whether it came to rest; False: it ran out of rounds
+    steepest_slope: Float[Array, "*n"]  # left between cells that can slide [rad]
+    missing: Float[Array, "*n"]  # volume that was to leave the pile and has not [m^3]
 
 
 @no_type_check

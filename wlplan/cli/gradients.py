@@ -10,9 +10,8 @@ from wlplan.cli.inputs import (
     check_models,
     check_pile_name,
     model_fields,
+    objective_named,
     pile_named,
-    receiver_at,
-    receiver_fields,
     site_named,
     world_named,
 )
@@ -49,7 +48,7 @@ _VERDICTS = {"ok": ("ok", None), "kink": ("kink", "yellow"), "wrong": ("WRONG", 
         remark=f"; at most {_MOST_LOADS_SIMULATOR} in the simulator",
     ),
     world_option,
-    objective_option("What the plan costs."),
+    objective_option("What the plan costs"),
     click.option(
         "--step",
         type=click.FloatRange(1e-9, 1e-3),
@@ -101,18 +100,24 @@ def gradcheck(
     folder = None if out is None else checked_folder(out)
 
     from wlplan.io import plan_to_dict
-    from wlplan.planning.job import Job
-    from wlplan.planning.objective import objective_named
+    from wlplan.planning.job import make_job
+    from wlplan.report.document import receiver_fields
     from wlplan.studies.gradcheck import SIMULATOR_TOLERANCE, TOLERANCE, check_gradient, random_plan
 
     if tolerance is None:
         tolerance = SIMULATOR_TOLERANCE if in_simulator else TOLERANCE
-    pile, source = pile_named(pile_file)
-    world, receiver = world_named(world_name, site, model, pile_state), receiver_at(pile, None)
-    checked_plan = random_plan(pile, loads, seed=seed)
+    pile, contour, source = pile_named(pile_file, site.machine)
+    world = world_named(world_name, site, model, pile_state)
+    job = make_job(
+        world,
+        pile,
+        site=site.with_receiver(pile, contour),
+        objective=objective_named(objective),
+    )
+    checked_plan = random_plan(pile, loads, seed=seed, contour=contour)
     with Progress() as progress, Stopwatch() as checking:
         check = check_gradient(
-            Job(world, pile, receiver, objective_named(objective)),
+            job,
             checked_plan,
             step=step,
             tolerance=tolerance,
@@ -127,7 +132,7 @@ def gradcheck(
         **model_fields(model, pile_state),
         "objective": objective,
         "seed": seed,
-        "receiver": receiver_fields(receiver),
+        "receiver": receiver_fields(job.site.placed_receiver),
         "loads": plan_to_dict(checked_plan)["loads"],
         **check.as_dict(),
     }

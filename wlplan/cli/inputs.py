@@ -1,4 +1,4 @@
-"""What the commands take in: checks that need nothing heavy, the pile, the world, the receiver."""
+"""What the commands take in: checks that need nothing heavy, the pile, the site, the world."""
 
 from __future__ import annotations
 
@@ -6,35 +6,33 @@ import dataclasses
 import hashlib
 import math
 import os
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wlplan.cli.options import BUNDLED
 from wlplan.cli.outputs import remark
 from wlplan.errors import InputError
+from wlplan.planning import planners
+from wlplan.planning.objectives import OBJECTIVES
+from wlplan.plugins import load_object
 from wlplan.site.machine import MACHINES, WA320, WheelLoader
 from wlplan.site.presets import machine_named, machine_recorded, soil_named, soil_recorded
 from wlplan.site.soil import GRAVEL, SOILS, Soil
+from wlplan.worlds.names import WORLDS, Learned
 
 if TYPE_CHECKING:
-    from jaxtyping import Array
-
-    from wlplan.planning.transport import Receiver
+    from wlplan.site.site import Site
+    from wlplan.terrain.toe import ToeContour
     from wlplan.types import Pile, World
 
 # Endings of the files that `wlplan.io` reads, repeated to keep help fast; a test compares them.
 PILE_ENDINGS = (".npz", ".tif", ".tiff", ".las", ".laz", ".ply")
 
-RECEIVER_FIELDS = ("x", "y", "heading")
-"""Fields of a receiver in plan.json."""
-
-# Farthest that a truck may stand from the middle of the map [m].
-_FARTHEST_TRUCK = 500.0
-
 
 @dataclasses.dataclass(frozen=True)
-class Site:
+class NamedSite:
     """What is dug and what digs, each with the name that it goes by."""
 
     soil_name: str = "gravel"
@@ -48,6 +46,30 @@ class Site:
             "soil": {"name": self.soil_name, "parameters": dataclasses.asdict(self.soil)},
             "machine": {"name": self.machine_name, "parameters": dataclasses.asdict(self.machine)},
         }
+
+    def with_receiver(
+        self, pile: Pile, contour: ToeContour, truck: tuple[float, ...] | None = None
+    ) -> Site:
+        """The site with its receiver.
+
+        Args:
+            pile: The pile, in the frame of the scan.
+            contour: Its toe.
+            truck: x [m], y [m] and, if given, heading [degree]; None for the default place.
+
+        Raises:
+            InputError: If the place lies on the pile or far away from it.
+        """
+        from wlplan.planning.placement import place_receiver
+        from wlplan.site.site import Site
+
+        receiver = None
+        if truck is not None:
+            heading = math.radians(truck[2]) if len(truck) == 3 else None
+            receiver = place_receiver(
+                pile, truck[:2], heading, machine=self.machine, contour=contour
+            )
+        return Site(machine=self.machine, soil=self.soil, receiver=receiver).beside(pile)
 
 
 def check_pile_name(name: str) -> None:
@@ -74,19 +96,16 @@ def check_models(model: str | None, pile_state: str | None, world: str) -> None:
     Raises:
         InputError: If so.
     """
-    for name, option, takers in (
-        (model, "--model", ("low", "high", "hybrid")),
-        (pile_state, "--pile-state", ("high",)),
-    ):
+    for name, option in ((model, "--model"), (pile_state, "--pile-state")):
         if name is None:
             continue
-        if world not in takers:
+        if not isinstance(WORLDS.get(world), Learned):
             raise InputError(f"{option} does not go with --world {world}: leave one of them out.")
         check_is_folder(name, "model", "wlplan train")
 
 
 def model_fields(model: str | None, pile_state: str | None) -> dict[str, str]:
-    """What plan.json and the like say about models in place of those that ship."""
+    """What plan.json and the like say about models that do not ship."""
     given = {"model": model, "pile_state": pile_state}
     return {name: path for name, path in given.items() if path is not None}
 
@@ -108,11 +127,12 @@ def check_is_folder(name: str, what: str, maker: str) -> None:
         raise InputError(f"{name}: is a file: a {what} is a folder, made with `{maker}`.")
 
 
-def pile_named(name: str) -> tuple[Pile, dict[str, Any]]:
-    """A pile, and what plan.json says about it.
+def pile_named(name: str, machine: WheelLoader) -> tuple[Pile, ToeContour, dict[str, Any]]:
+    """A pile, its toe, and what plan.json says about it.
 
     Args:
         name: Path of the pile file, or `BUNDLED`.
+        machine: What digs.
 
     Raises:
         InputError: If it cannot be read or dug.
@@ -122,7 +142,7 @@ def pile_named(name: str) -> tuple[Pile, dict[str, Any]]:
 
     path = bundled_pile_path() if name == BUNDLED else Path(name)
     pile = read_pile(path)
-    toe_contour(pile)  # a pile that cannot be dug is refused here
+    contour = toe_contour(pile, machine=machine)
     fields = {
         "file": f"{BUNDLED} ({path.name})" if name == BUNDLED else name,
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -130,10 +150,12 @@ def pile_named(name: str) -> tuple[Pile, dict[str, Any]]:
         "cell_size": pile.cell_size,
         "origin": [float(value) for value in pile.origin],
     }
-    return pile, fields
+    return pile, contour, fields
 
 
-def site_named(soil: str | None, machine: str | None, *, otherwise: Site = Site()) -> Site:
+def site_named(
+    soil: str | None, machine: str | None, *, otherwise: NamedSite = NamedSite()
+) -> NamedSite:
     """The soil and the machine of the options.
 
     Args:
@@ -152,7 +174,7 @@ def site_named(soil: str | None, machine: str | None, *, otherwise: Site = Site(
     return site
 
 
-def site_recorded(document: Mapping[str, Any], file: str) -> Site:
+def site_recorded(document: Mapping[str, Any], file: str) -> NamedSite:
     """The soil and the machine that a document recorded; the presets where it has none.
 
     Args:
@@ -163,7 +185,7 @@ def site_recorded(document: Mapping[str, Any], file: str) -> Site:
         InputError: If what it says about them cannot be used.
     """
     try:
-        site = Site()
+        site = NamedSite()
         if "soil" in document:
             name, parameters = _record(document, "soil")
             site = dataclasses.replace(site, soil_name=name, soil=soil_recorded(parameters))
@@ -185,35 +207,69 @@ def _record(document: Mapping[str, Any], part: str) -> tuple[str, object]:
 
 
 def world_named(
-    name: str, site: Site, model: str | None = None, pile_state: str | None = None
+    name: str, site: NamedSite, model: str | None = None, pile_state: str | None = None
 ) -> World:
-    """A world of `WORLDS` at a site.
+    """A world by name, at a site, or one that somebody else wrote.
 
-    Tells on stderr if it is learned and a model of it was trained for another site.
+    Remarks on stderr if it is learned and a model of it was trained for another site.
 
     Args:
-        name: Name of the world.
+        name: Name of the world, or `package.module:function`.
         site: What is dug and what digs.
-        model: Folder of a ψ in place of the one that ships with the package.
-        pile_state: Folder of a φ likewise, for the high world.
+        model: Folder of a ψ instead of the one that ships with the package.
+        pile_state: Folder of a φ likewise.
     """
-    from wlplan.worlds.library import MODELS, load_world
+    from wlplan.worlds.library import load_world
 
-    # Only the high world asks for it.
-    second = {} if pile_state is None else {"pile_state": pile_state}
-    world = load_world(name, model=model, soil=site.soil, machine=site.machine, **second)
-    for kind, given in zip(MODELS.get(name, ()), (model, pile_state), strict=False):
-        if _remark_on_training(kind, given, site):
-            break
+    if name not in WORLDS:
+        return _outside(name)
+    world = load_world(
+        name, model=model, pile_state=pile_state, soil=site.soil, machine=site.machine
+    )
+    recipe = WORLDS[name]
+    if isinstance(recipe, Learned):
+        for kind, given in zip(recipe, (model, pile_state), strict=True):
+            if (kind or given) and _remark_on_training(kind, given, site):
+                break
     return world
 
 
-def _remark_on_training(kind: str, model: str | None, site: Site) -> bool:
-    """Tell if a model was trained for another soil or machine than those of a site."""
+def planner_named(name: str) -> Any:
+    """A planner by name as it is, or one that somebody else wrote."""
+    return name if name in planners.NAMES else _outside(name)
+
+
+def objective_named(name: str) -> Any:
+    """An objective by name as it is, or one that somebody else wrote."""
+    return name if name in OBJECTIVES else _outside(name)
+
+
+def _outside(reference: str) -> Any:
+    """What `package.module:Name` names; of a class an instance with its defaults.
+
+    The folder where the command is run is searched last, so that nothing in it stands in for a
+    module that is installed.
+    """
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    found = load_object(reference)
+    if not isinstance(found, type):
+        return found
+    try:
+        return found()
+    except TypeError as error:
+        raise InputError(
+            f"{reference}: cannot be made without arguments ({error}): give all its settings "
+            f"defaults, or name a value."
+        ) from error
+
+
+def _remark_on_training(kind: str | None, model: str | None, site: NamedSite) -> bool:
+    """Remarks if a model was trained for another soil or machine than those of a site."""
     from wlplan.models.storage import read_description
     from wlplan.worlds.library import pretrained_path
 
-    folder = pretrained_path(kind) if model is None else Path(model)
+    folder = pretrained_path(str(kind)) if model is None else Path(model)
     data = read_description(folder, None).get("dataset")
     data = data if isinstance(data, dict) else {}
     trained = {part: data.get(part) for part in ("soil", "machine")}
@@ -248,72 +304,3 @@ def _agree(recorded: Any, values: Soil | WheelLoader) -> bool:
     return isinstance(recorded, dict) and all(
         recorded.get(name, value) == value for name, value in dataclasses.asdict(values).items()
     )
-
-
-def receiver_at(pile: Pile, truck: tuple[float, ...] | None) -> Receiver:
-    """Where the loader dumps.
-
-    Args:
-        pile: The pile, in the frame of the scan.
-        truck: x [m], y [m] and, if given, heading [degree]; None for the default place.
-
-    Raises:
-        InputError: If the place lies on the pile or far away from it.
-    """
-    import jax.numpy as jnp
-    import numpy as np
-
-    from wlplan.planning.transport import Receiver, default_receiver
-    from wlplan.terrain.heightmap import sample
-
-    if truck is None:
-        return default_receiver(pile)
-    x, y = truck[:2]
-    size = pile.cell_size * np.array(pile.height.shape)
-    low = np.asarray(pile.origin, float)
-    away = math.hypot(*(np.array([x, y]) - low - 0.5 * size))
-    if away > _FARTHEST_TRUCK:
-        raise InputError(
-            f"--truck {x:g},{y:g} lies {away:.0f} m from the middle of the map, which spans x "
-            f"{low[0]:.1f} to {low[0] + size[0]:.1f} and y {low[1]:.1f} to {low[1] + size[1]:.1f} "
-            f"m: give it in that frame (whole kilometres of survey coordinates are taken off)."
-        )
-    dtype = pile.height.dtype
-    above = pile.height - pile.floor
-    place = [jnp.asarray(value, dtype) for value in (x, y)]
-    inside = bool(np.all((np.array([x, y]) >= low) & (np.array([x, y]) <= low + size)))
-    if inside and float(sample(above, pile, *place)) > 0.5:
-        raise InputError(f"--truck {x:g},{y:g} lies on the pile: give a place beside it.")
-    if len(truck) == 3:
-        heading = math.remainder(math.radians(truck[2]), 2.0 * math.pi)
-    else:
-        heading = _heading_of_shortest_ways(pile, place)
-    return Receiver(*place, jnp.asarray(heading, dtype))  # type: ignore[call-arg]
-
-
-def _heading_of_shortest_ways(pile: Pile, place: Sequence[Array]) -> float:
-    """Heading [rad] at a place x, y [m] from where the ways to the toe are shortest on average."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from wlplan.planning.transport import Receiver, v_turn_length
-    from wlplan.studies.diggability import edge_poses
-    from wlplan.terrain.toe import toe_contour
-
-    dtype = pile.height.dtype
-    poses = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), edge_poses(toe_contour(pile), 24))
-    headings = np.radians(np.arange(-180.0, 180.0, 5.0))
-    lengths = jax.jit(
-        jax.vmap(
-            lambda h: jax.vmap(
-                lambda pose: v_turn_length(pose, Receiver(*place, h))  # type: ignore[call-arg]
-            )(poses).mean()
-        )
-    )(jnp.asarray(headings, dtype))
-    return float(headings[int(np.argmin(lengths))])
-
-
-def receiver_fields(receiver: Receiver) -> dict[str, float]:
-    """What plan.json says about a receiver: x [m], y [m] and heading [rad]."""
-    return {name: float(getattr(receiver, name)) for name in RECEIVER_FIELDS}

@@ -87,12 +87,14 @@ def diggability(
     from wlplan.studies.diggability import diggability_map
     from wlplan.types import Action
 
-    pile, source = pile_named(pile_file)
+    pile, contour, source = pile_named(pile_file, site.machine)
     world = world_named(world_name, site, model, pile_state)
     fixed = Action(*action)
     with Progress() as progress, Stopwatch() as mapping:
         progress("diggability", 0, 1, None)
-        found = ready(diggability_map(world, pile, locations=locations, action=fixed))
+        found = ready(
+            diggability_map(world, pile, locations=locations, action=fixed, contour=contour)
+        )
         progress("diggability", 1, 1, None)
 
     records = {

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import click
 
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
+from wlplan.planning import planners
+from wlplan.planning.objectives import OBJECTIVES
+from wlplan.plugins import is_reference
 from wlplan.site.machine import MACHINES
 from wlplan.site.soil import SOILS
+from wlplan.worlds.names import ENGINES, FOR_PLANNING
 
 # Names that the modules behind define, repeated here to keep help fast; a test compares them.
-WORLDS = ("low", "high", "hybrid", "simulator")
-ENGINES = ("simulator", "dem")
-PLANNERS = ("gradient", "greedy", "nominal")
-OBJECTIVES = ("efficiency", "productivity", "energy")
 ACTIVATIONS = ("swish", "leaky_relu")
 ENCODERS = ("convolutional", "principal")
 PROTOCOLS = ("paper", "corridor", "slow")
@@ -125,6 +125,36 @@ class ShardNumber(click.ParamType):
         return number, count
 
 
+class NameOrReference(click.ParamType):
+    """A name that the package knows, or `package.module:Name` of what somebody else wrote.
+
+    Args:
+        what: What is named, in words.
+        names: Names that the package knows.
+    """
+
+    name = "NAME|MODULE:NAME"
+
+    def __init__(self, what: str, names: Iterable[str]):
+        self._what, self._names = what, tuple(names)
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """What stands for the value in the help."""
+        return self.name
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The text, if it can be one of them."""
+        text = str(value)
+        if text not in self._names and not is_reference(text):
+            self.fail(
+                f"{text!r} is no {self._what}: choose one of {', '.join(self._names)}, or name "
+                f"your own as package.module:Name",
+                param,
+                ctx,
+            )
+        return text
+
+
 def with_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """A decorator: several click options at once, then those that every command has."""
     common = (
@@ -167,10 +197,11 @@ def objective_option(purpose: str) -> Callable[[Any], Any]:
     """The option that says what a plan costs; `purpose` is its help."""
     return click.option(
         "--objective",
-        type=click.Choice(OBJECTIVES),
-        default=OBJECTIVES[0],
+        type=NameOrReference("objective", OBJECTIVES),
+        default=next(iter(OBJECTIVES)),
         show_default=True,
-        help=purpose,
+        help=f"{purpose}: {', '.join(OBJECTIVES)}, or package.module:name of terms or a function "
+        f"of a loading.",
     )
 
 
@@ -202,10 +233,17 @@ pile_argument = click.argument("pile_file", metavar="[PILE]", default=BUNDLED)
 world_option = click.option(
     "--world",
     "world_name",
-    type=click.Choice(WORLDS),
-    default="low",
+    type=NameOrReference("world", FOR_PLANNING),
+    default="hybrid",
     show_default=True,
-    help="What predicts: a learned world or the simulator.",
+    help=f"What predicts: {', '.join(FOR_PLANNING)}, or package.module:function.",
+)
+planner_option = click.option(
+    "--planner",
+    type=NameOrReference("planner", planners.NAMES),
+    default="gradient",
+    show_default=True,
+    help=f"How to plan: {', '.join(planners.NAMES)}, or package.module:Name of a class or value.",
 )
 engine_option = click.option(
     "--engine",
@@ -219,14 +257,15 @@ model_options = (
         "--model",
         metavar="DIR",
         default=None,
-        help="ψ from `wlplan train` in place of the one that ships: psi-low for --world low, "
-        "psi-high for high and hybrid.",
+        help="ψ from `wlplan train`, psi-low or psi-high, for a learned world instead of the one "
+        "that ships.",
     ),
     click.option(
         "--pile-state",
         metavar="DIR",
         default=None,
-        help="φ from `wlplan train`, for --world high, in place of the one that ships.",
+        help="φ from `wlplan train` for a learned world, instead of the one that ships or of the "
+        "automaton alone.",
     ),
 )
 truck_option = click.option(

@@ -9,42 +9,38 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from wlplan.cli.engines import play_in
 from wlplan.cli.inputs import (
-    RECEIVER_FIELDS,
     check_models,
     check_pile_name,
     model_fields,
+    objective_named,
     pile_named,
-    receiver_at,
-    receiver_fields,
+    planner_named,
     site_named,
     site_recorded,
     world_named,
 )
 from wlplan.cli.options import (
     OBJECTIVES,
-    PLANNERS,
     engine_option,
     loads_option,
     model_options,
     objective_option,
     out_option,
     pile_argument,
+    planner_option,
     site_options,
     truck_option,
     with_options,
     world_option,
 )
 from wlplan.cli.outputs import checked_folder, json_text, remark, staged
-from wlplan.cli.played import ledger_of, print_plan, remark_on_ledger, totals, transport_totals
+from wlplan.cli.plan_table import print_plan, remark_on_ledger
 from wlplan.cli.progress import Progress, Stopwatch, ready
 from wlplan.constants import QUANTITIES
 
 if TYPE_CHECKING:
-    from wlplan.planning.plan import PlanResult
-    from wlplan.planning.transport import Receiver
-    from wlplan.types import Performance, Pile
+    from wlplan.types import Performance
 
 _MOST_LOADS = 500
 # What a plan says about where it comes from; playing it again keeps that.
@@ -56,10 +52,8 @@ _ORIGIN_FIELDS = ("world", "model", "pile_state", "planner", "seed")
 @with_options(
     loads_option(default=15, most=_MOST_LOADS),
     world_option,
-    click.option(
-        "--planner", type=click.Choice(PLANNERS), default="gradient", show_default=True, help="How."
-    ),
-    objective_option("What for."),
+    planner_option,
+    objective_option("What to make small"),
     click.option(
         "--referee/--no-referee",
         default=True,
@@ -96,15 +90,17 @@ def plan(
     site = site_named(soil, machine)
     folder = None if out is None else checked_folder(out)
 
-    from wlplan.io import plan_to_dict
-    from wlplan.planning.plan import plan_loads
+    from wlplan.planning.objective import objective_of
+    from wlplan.planning.plan import plan_loads, play
+    from wlplan.report.document import plan_document, violations_of, write_plan_folder
 
-    pile, source = pile_named(pile_file)
-    receiver = receiver_at(pile, truck)
-    world, simulator = (
-        world_named(world_name, site, model, pile_state),
-        world_named("simulator", site),
-    )
+    pile, contour, source = pile_named(pile_file, site.machine)
+    world = world_named(world_name, site, model, pile_state)
+    simulator = world_named("simulator", site)
+    goal = objective_of(objective_named(objective))
+    chosen = planner_named(planner)
+    in_simulator = world_name == "simulator"
+    place = site.with_receiver(pile, contour, truck)
     with Progress() as progress:
         with Stopwatch() as planning:
             planned = ready(
@@ -112,34 +108,29 @@ def plan(
                     world,
                     pile,
                     loads=loads,
-                    objective=objective,
-                    planner=planner,
-                    receiver=receiver,
+                    objective=goal,
+                    planner=chosen,
+                    site=place,
                     seed=seed,
-                    referee=simulator if referee and world_name != "simulator" else None,
+                    referee=simulator if referee and not in_simulator else None,
                     progress=progress,
+                    contour=contour,
                 )
             )
         with Stopwatch() as playing:
-            if world_name == "simulator":
-                simulated = planned
-            elif planned.refereed is not None:
-                simulated = planned.refereed
-            else:
-                simulated, _ = play_in(
-                    simulator,
-                    pile,
-                    planned.plan,
-                    objective=objective,
-                    receiver=receiver,
-                    progress=progress,
-                )
+            simulated = planned.refereed or planned
+            if planned.refereed is None and not in_simulator:
+                progress("simulator", 0, 1, None)
+                simulated = ready(play(simulator, pile, planned.plan, objective=goal, site=place))
+                progress("simulator", 1, 1, None)
 
-    document = plan_to_dict(
-        planned.plan,
+    document = plan_document(
+        pile,
+        simulated,
+        receiver=place.placed_receiver,
+        soil=site.soil,
         predicted=planned.rollout.performance,
-        simulated=simulated.rollout.performance,
-        transport={"time": planned.transport_time, "work": planned.transport_work},
+        predicted_cost=float(planned.cost),
         pile=source,
         **site.fields(),
         world=world_name,
@@ -148,77 +139,46 @@ def plan(
         referee=referee,
         seed=seed,
         **model_fields(model, pile_state),
-        receiver=receiver_fields(receiver),
-        total={
-            "predicted": totals(planned.rollout.performance, planned.cost),
-            "simulated": totals(simulated.rollout.performance, simulated.cost),
-            "transport": transport_totals(planned),
-        },
-        ledger=ledger_of(pile, simulated, simulator),
     )
     text = json_text(document)
     seconds = {"planning": planning.text()}
     if planned.refereed is None:
         seconds["simulator"] = playing.text()
+    written = None
     if folder is not None:
-        _write_plan(folder, document, pile, planned, simulated, receiver, seconds)
+        with staged(folder) as staging:
+            written = write_plan_folder(
+                staging,
+                document,
+                pile,
+                simulated,
+                receiver=place.placed_receiver,
+                predicted=planned.rollout.performance,
+                settings={f"{name}, wall clock": text for name, text in seconds.items()},
+            )
     remark_on_ledger(document["ledger"])
+    for name, numbers in violations_of(planned, goal.constraints).items():
+        remark(f"{name} is violated by load {', '.join(map(str, numbers))}")
     if as_json:
         click.echo(text)
         return
     print_plan(document)
     print("; ".join(f"{name} {text}" for name, text in seconds.items()))
-    if folder is None:
+    _print_written(folder, written)
+
+
+def _print_written(folder: Path | None, written: list[str] | None) -> None:
+    if folder is None or written is None:
         print("nothing written: --out DIR writes the plan, the figures and a report")
-    else:
-        print(f"written: {folder / 'report.html'}, and plan.json, plan.png, totals.png beside it")
-
-
-def _write_plan(
-    folder: Path,
-    document: Mapping[str, Any],
-    pile: Pile,
-    planned: PlanResult,
-    simulated: PlanResult,
-    receiver: Receiver,
-    seconds: Mapping[str, str],
-) -> None:
-    from wlplan.io import write_bytes_atomic, write_plan
-    from wlplan.report import figures as plots
-    from wlplan.report.page import write_report
-
-    count = len(document["loads"])
-    map_png = plots.png_bytes(
-        plots.plan_figure(
-            pile,
-            simulated.rollout.pile,
-            planned.plan,
-            receiver=receiver,
-            after_title=f"After {count} load{'s' if count > 1 else ''} in the simulator",
-        )
-    )
-    totals_png = plots.png_bytes(
-        plots.totals_figure(planned.rollout.performance, simulated.rollout.performance)
-    )
-    with staged(folder) as staging:
-        write_plan(staging / "plan.json", document)
-        write_bytes_atomic(staging / "plan.png", map_png)
-        write_bytes_atomic(staging / "totals.png", totals_png)
-        write_report(
-            staging,
-            document,
-            figures=(
-                (map_png, "The pile and the digs"),
-                (totals_png, "Predicted beside simulated"),
-            ),
-            settings={f"{name}, wall clock": text for name, text in seconds.items()},
-        )
+        return
+    first, *others = written
+    print(f"written: {folder / first}, and {', '.join(others)} beside it")
 
 
 @click.command()
 @click.argument("pile_file", metavar="PILE")
 @click.argument("plan_file", metavar="PLAN.json")
-@with_options(engine_option, truck_option, *site_options("that of the plan"))
+@with_options(engine_option, truck_option, *site_options("that of the plan"), out_option)
 def simulate(
     pile_file: str,
     plan_file: str,
@@ -226,10 +186,13 @@ def simulate(
     truck: tuple[float, ...] | None,
     soil: str | None,
     machine: str | None,
+    out: str | None,
     seed: int,
     as_json: bool,
 ) -> None:
     """Play PLAN.json in an engine on PILE and compare with what was predicted.
+
+    With --out: plan.json, plan.png, totals.png and report.html, of the plan as it was played.
 
     Truck, soil and machine are those of the plan, unless given. No engine has randomness, so
     --seed changes nothing. Interrupted with --engine dem, the same command goes on where it was.
@@ -237,60 +200,89 @@ def simulate(
     check_pile_name(pile_file)
     site_named(soil, machine)  # wrong options are refused before anything heavy is imported
 
-    from wlplan.io import plan_to_dict, read_plan
+    folder = None if out is None else checked_folder(out)
+
+    from wlplan.io import read_plan
+    from wlplan.planning.plan import play
+    from wlplan.report.document import plan_document, write_plan_folder
 
     loading_plan, given = read_plan(plan_file)
-    pile, source = pile_named(pile_file)
+    recorded = site_recorded(given, plan_file)
+    site = site_named(soil, machine, otherwise=recorded)
+    pile, contour, source = pile_named(pile_file, site.machine)
     made_for = given.get("pile")
     if isinstance(made_for, dict) and made_for.get("sha256", source["sha256"]) != source["sha256"]:
         remark("the plan was made for another pile file than this one")
-    recorded = site_recorded(given, plan_file)
-    site = site_named(soil, machine, otherwise=recorded)
     if (site.soil, site.machine) != (recorded.soil, recorded.machine):
         remark("the plan was made for another soil or machine than it is played with")
     objective = given.get("objective")
-    objective = objective if objective in OBJECTIVES else OBJECTIVES[0]
-    receiver = receiver_at(pile, truck if truck is not None else _truck_of(given))
+    # A name of somebody else's module in a file is no reason to run it.
+    objective = objective if objective in OBJECTIVES else next(iter(OBJECTIVES))
+    place = site.with_receiver(pile, contour, truck if truck is not None else _truck_of(given))
+    cycles: list[Any] = []
+    count = len(given["loads"])
     with Progress() as progress, Stopwatch() as playing:
-        world = world_named(engine, site)
-        played, cycles = play_in(
-            world, pile, loading_plan, objective=objective, receiver=receiver, progress=progress
+
+        def keep(number: int, record: Any) -> None:
+            cycles.append(record.as_dict())
+            progress(engine, number, count, None)
+
+        progress(engine, 0, count, None)
+        played = ready(
+            play(
+                world_named(engine, site),
+                pile,
+                loading_plan,
+                objective=objective,
+                site=place,
+                note=remark,
+                record=keep,
+            )
         )
+        progress(engine, count, count, None)
 
     predicted = _predicted_of(given)
-    total = {
-        "simulated": totals(played.rollout.performance, played.cost),
-        "transport": transport_totals(played),
-    }
-    if predicted is not None:
-        total = {"predicted": _given_totals(predicted, given), **total}
-    document = plan_to_dict(
-        loading_plan,
+    document = plan_document(
+        pile,
+        played,
+        receiver=place.placed_receiver,
+        soil=site.soil,
         predicted=predicted,
-        simulated=played.rollout.performance,
-        transport={"time": played.transport_time, "work": played.transport_work},
+        predicted_cost=None if predicted is None else _predicted_cost(given),
         pile=source,
         **site.fields(),
         **{name: given[name] for name in _ORIGIN_FIELDS if name in given},
         objective=objective,
-        receiver=receiver_fields(receiver),
-        total=total,
-        ledger=ledger_of(pile, played, world),
-        **({} if cycles is None else {"engine": engine}),
+        **({"engine": engine} if cycles else {}),
     )
-    for load, cycle in zip(document["loads"], cycles or (), strict=False):
+    for load, cycle in zip(document["loads"], cycles, strict=False):
         load["cycle"] = cycle
     text = json_text(document)
+    written = None
+    if folder is not None:
+        with staged(folder) as staging:
+            written = write_plan_folder(
+                staging,
+                document,
+                pile,
+                played,
+                receiver=place.placed_receiver,
+                predicted=predicted,
+                settings={f"{engine}, wall clock": playing.text()},
+            )
     remark_on_ledger(document["ledger"])
     if as_json:
         click.echo(text)
         return
     print_plan(document)
     print(f"{engine} {playing.text()}")
+    _print_written(folder, written)
 
 
 def _truck_of(document: Mapping[str, Any]) -> tuple[float, ...] | None:
     """The truck that a plan was made for, as of the option; None if it names none."""
+    from wlplan.report.document import RECEIVER_FIELDS
+
     record = document.get("receiver")
     values = [record.get(name) if isinstance(record, dict) else None for name in RECEIVER_FIELDS]
     if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
@@ -315,10 +307,11 @@ def _predicted_of(document: Mapping[str, Any]) -> Performance | None:
     return Performance(*np.array(rows, dtype=float).T)
 
 
-def _given_totals(predicted: Performance, document: Mapping[str, Any]) -> dict[str, float]:
-    """The sums that a plan predicts, with the cost if it names one."""
+def _predicted_cost(document: Mapping[str, Any]) -> float | None:
+    """The cost that a plan predicts, if it names one."""
     try:
         cost = document["total"]["predicted"]["cost"]
     except (KeyError, TypeError):
-        cost = None
-    return totals(predicted, cost if isinstance(cost, int | float) else None)
+        return None
+    is_number = isinstance(cost, int | float) and not isinstance(cost, bool)
+    return float(cost) if is_number else None

@@ -187,7 +187,7 @@ def _leave(
     cycles = outcome(one, machine=simulator.machine, soil=simulator.soil)
     cycle = jax.tree.map(lambda part: part[..., 0], cycles)
     pile, dig_pose = Pile(height, CELL_SIZE, origin), Pose(*pose)
-    after, performance = simulator.leave(pile, dig_pose, view, cycle)
+    after, performance, _ = simulator.leave(pile, dig_pose, view, cycle)
 
     def reference(displacement: float) -> Array:
         point = to_world(dig_pose, jnp.asarray(-displacement), jnp.asarray(0.0))

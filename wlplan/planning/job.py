@@ -1,40 +1,92 @@
-"""What every planner optimises: decisions for N loadings, and what they cost."""
+"""What every planner works on: a job, decisions for N loadings, and what they come to."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import no_type_check
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from wlplan.constants import ACTION_HIGH, ACTION_LOW
-from wlplan.planning.objective import Objective, loading_cost
-from wlplan.planning.poses import Toe, pose_at
+from wlplan.actions import squash
+from wlplan.checks import check_pile, check_world
+from wlplan.errors import InputError
+from wlplan.planning.loading import Loading, Transport
+from wlplan.planning.objective import Objective, objective_of
+from wlplan.planning.poses import Toe, pose_at, toe_of
 from wlplan.planning.rollout import closed_loop
-from wlplan.planning.transport import Receiver, transport
-from wlplan.types import Action, LoadingPlan, Pile, Pose, Rollout, World, action_from
+from wlplan.planning.transport import transport
+from wlplan.site.site import Site
+from wlplan.terrain.toe import ToeContour, toe_contour
+from wlplan.types import (
+    Action,
+    LoadingPlan,
+    Performance,
+    Pile,
+    Pose,
+    Rollout,
+    SolveReport,
+    World,
+)
+from wlplan.worlds.capabilities import as_pytree, is_differentiable
 from wlplan.xla import ParallelMap
 
 
 @no_type_check
 class Job(struct.PyTreeNode):
-    """A pile to load from, and for what."""
+    """What is asked for: a pile to load from at a site, for an objective, as a world sees it."""
 
     world: World
     pile: Pile
-    receiver: Receiver
+    site: Site  # with its receiver
     objective: Objective = struct.field(pytree_node=False)
+    toe: Toe | None = None  # to dig along; None where plans with poses of their own are played
 
 
-@no_type_check
-class ToeJob(Job):
-    """A job whose loadings are decided along the toe of the pile."""
+def make_job(
+    world: World,
+    pile: Pile,
+    *,
+    site: Site | None = None,
+    objective: str | Objective | Mapping[str, Any] | Callable[..., Any] = "efficiency",
+) -> Job:
+    """A job without a toe, once everything that users get wrong was looked at.
 
-    toe: Toe = struct.field(kw_only=True)
+    Args:
+        world: World to plan or play in.
+        pile: The pile before the first loading.
+        site: Machine, soil and receiver; default: the WA320 in gravel. Without a receiver it has
+            the default one of the pile.
+        objective: A name, an `Objective`, named terms, or a function of a loading.
+
+    Raises:
+        InputError: If one of them cannot be used; one line that says what to do.
+    """
+    check_world(world)
+    check_pile(pile)
+    return Job(
+        world=as_pytree(world),
+        pile=pile,
+        site=(Site() if site is None else site).beside(pile),
+        objective=objective_of(objective),
+    )
+
+
+def with_toe(job: Job, contour: ToeContour | None = None) -> Job:
+    """The job with a toe to dig along.
+
+    Args:
+        job: Any job.
+        contour: Toe of its pile where it is known already; by default it is traced.
+
+    Raises:
+        InputError: If there is nothing to dig, or a bucket can start nowhere.
+    """
+    if contour is None:
+        contour = toe_contour(job.pile, machine=job.site.machine)
+    return job.replace(toe=toe_of(contour, job.site.machine, job.pile.height.dtype))
 
 
 @no_type_check
@@ -47,83 +99,102 @@ class Decisions(struct.PyTreeNode):
 
 
 @no_type_check
-class Outcome(struct.PyTreeNode):
-    """A played plan."""
+class PlanResult(struct.PyTreeNode):
+    """A played plan: what it yields and costs in the world it was played in."""
 
     plan: LoadingPlan  # leaves (N,)
     rollout: Rollout
-    transport_time: Float[Array, " n"]  # [s]
-    transport_work: Float[Array, " n"]  # [kJ]
+    transport: Transport  # leaves (N,)
+    terms: dict[str, Float[Array, " n"]]  # of the objective, by name, without their weights
     costs: Float[Array, " n"]  # of the loadings
     cost: Float[Array, ""]  # their sum
-    refereed: Outcome | None = None  # the same plan played by the referee, if there was one
+    solves: SolveReport | None = None  # leaves (N,); None: the world does not say
+    refereed: PlanResult | None = None  # the same plan played by the referee, if there was one
 
 
-_LOW = np.asarray(ACTION_LOW)
-_RANGE = np.asarray(ACTION_HIGH) - _LOW
-
-
-def squash(raw: Float[Array, "4"]) -> Action:
-    """Action inside its box."""
-    low, span = jnp.asarray(_LOW, raw.dtype), jnp.asarray(_RANGE, raw.dtype)
-    return action_from(low + jax.nn.sigmoid(raw) * span)
-
-
-def unsquash(part: Float[np.ndarray, "*n 4"]) -> Float[np.ndarray, "*n 4"]:
-    """Inverse of `squash` for parts of the box; its edges are moved in by a hundredth."""
-    part = np.clip(part, 0.01, 0.99)
-    return np.log(part / (1.0 - part))
-
-
-def decide(job: ToeJob, pile: Pile, decisions: Decisions) -> tuple[Pose, Action]:
+def decide(job: Job, pile: Pile, decisions: Decisions) -> tuple[Pose, Action]:
     """Pose and action of one loading on the pile as it is."""
+    assert job.toe is not None
     return pose_at(job.toe, pile, decisions.position, decisions.offset), squash(decisions.action)
 
 
-def judged(
-    receiver: Receiver, objective: Objective, plan: LoadingPlan, outcome: Rollout
-) -> Outcome:
-    """A plan that was played, with its transport and its cost."""
-    time, work = jax.vmap(lambda pose, mass: transport(pose, receiver, mass))(
-        plan.pose, outcome.performance.mass
+class Assessed(struct.PyTreeNode):
+    """A loading that was played, and what it counts."""
+
+    plan: LoadingPlan
+    performance: Performance
+    transport: Transport
+    terms: dict[str, Array]
+    cost: Array
+
+
+def assess(job: Job, pile: Pile, pose: Pose, action: Action, performance: Performance) -> Assessed:
+    """Transport, terms and cost of one loading.
+
+    Args:
+        job: Site and objective.
+        pile: The pile before the loading.
+        pose: Dig location and heading.
+        action: Parameters of the bucket-filling controller.
+        performance: What the loading yields.
+    """
+    way = transport(pose, performance.mass, job.site)
+    loading = Loading(pile, pose, action, performance, way, job.site)
+    terms = job.objective.values(loading)
+    return Assessed(LoadingPlan(pose, action), performance, way, terms, job.objective.cost(terms))
+
+
+def assemble(loadings: Assessed, pile: Pile, solves: SolveReport | None = None) -> PlanResult:
+    """Loadings in order, leaves with leading axis N, and the pile after the last as a result."""
+    return PlanResult(
+        plan=loadings.plan,
+        rollout=Rollout(performance=loadings.performance, pile=pile),
+        transport=loadings.transport,
+        terms=loadings.terms,
+        costs=loadings.cost,
+        cost=loadings.cost.sum(),
+        solves=solves,
     )
-    costs = loading_cost(objective, outcome.performance, time, work)
-    return Outcome(
-        plan=plan,
-        rollout=outcome,
-        transport_time=time,
-        transport_work=work,
-        costs=costs,
-        cost=costs.sum(),
+
+
+def play_candidate(
+    job: Job, candidate: Decisions | LoadingPlan, *, report: bool = True
+) -> PlanResult:
+    """Plays a plan, leaves with leading axis N.
+
+    Args:
+        job: World, pile, site and objective; for decisions the toe too.
+        candidate: Decisions, each taken on the pile that the ones before left, or fixed poses.
+        report: Whether to look at how the world's solvers ended, where it says so.
+    """
+    solve = getattr(job.world, "solve", None) if report else None
+
+    def decide_one(pile: Pile, one: Decisions | LoadingPlan) -> tuple[Pose, Action]:
+        if isinstance(one, Decisions):
+            return decide(job, pile, one)
+        return one.pose, one.action
+
+    def record(
+        pile: Pile, pose: Pose, action: Action, performance: Performance, *solved: SolveReport
+    ) -> tuple[Assessed, SolveReport | None]:
+        return assess(job, pile, pose, action, performance), (solved[0] if solved else None)
+
+    after, (loadings, solves) = closed_loop(
+        job.world if solve is None else solve, job.pile, candidate, decide_one, record
     )
+    return assemble(loadings, after, solves)
 
 
-def play_decisions(job: ToeJob, decisions: Decisions) -> Outcome:
-    """Plays decisions, leaves with leading axis N, each on the pile that the ones before left."""
-    outcome, plan = closed_loop(
-        job.world, job.pile, decisions, lambda pile, d: decide(job, pile, d)
-    )
-    return judged(job.receiver, job.objective, plan, outcome)
-
-
-def play_plan(job: Job, plan: LoadingPlan) -> Outcome:
-    """Plays a plan with its poses as they are."""
-    outcome, plan = closed_loop(
-        job.world, job.pile, plan, lambda _, loading: (loading.pose, loading.action)
-    )
-    return judged(job.receiver, job.objective, plan, outcome)
-
-
-def cost_of_one(job: ToeJob, pile: Pile, decisions: Decisions) -> Float[Array, ""]:
+def cost_of_next(job: Job, pile: Pile, decisions: Decisions) -> Float[Array, ""]:
     """Cost of a single loading on a given pile; what becomes of the pile is not computed."""
     pose, action = decide(job, pile, decisions)
     _, performance = job.world(pile, pose, action)
-    time, work = transport(pose, job.receiver, performance.mass)
-    return loading_cost(job.objective, performance, time, work)
+    return assess(job, pile, pose, action, performance).cost
 
 
-def contour_length(job: ToeJob) -> Float[Array, ""]:
+def contour_length(job: Job) -> Float[Array, ""]:
     """Length of the toe contour [m]."""
+    assert job.toe is not None
     steps = job.toe.points[1:] - job.toe.points[:-1]
     return jnp.sqrt((steps**2).sum(axis=1)).sum()
 
@@ -133,16 +204,49 @@ def stacked(decisions: Sequence[Decisions]) -> Decisions:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *decisions)
 
 
-outcomes = ParallelMap(play_decisions)
-"""`outcomes(job, plans)` plays several plans; leaves [K, N]."""
-
-played = ParallelMap(play_plan)
-"""`played(job, plans)` plays several fixed plans; leaves [K, N]."""
+outcomes = ParallelMap(play_candidate)
+"""`outcomes(job, candidates)` plays several plans; leaves [K, N]."""
 
 
-def _cost_and_gradient(job: ToeJob, plan: Decisions) -> tuple[Float[Array, ""], Decisions]:
-    return jax.value_and_grad(lambda decisions: play_decisions(job, decisions).cost)(plan)
+def _cost_and_gradient(
+    job: Job, candidate: Decisions | LoadingPlan
+) -> tuple[Float[Array, ""], Any]:
+    return jax.value_and_grad(lambda plan: play_candidate(job, plan, report=False).cost)(candidate)
 
 
 costs_and_gradients = ParallelMap(_cost_and_gradient)
-"""`costs_and_gradients(job, plans)`: cost of several plans, leaves [K, N], and its gradient."""
+"""`costs_and_gradients(job, candidates)`: cost of several plans, leaves [K, N], and gradient."""
+
+
+def check_has_gradient(job: Job, remedy: str) -> None:
+    """Refuses a job in a world without a derivative, before JAX does.
+
+    Args:
+        job: Any job.
+        remedy: What to do about it, in words that follow a colon.
+
+    Raises:
+        InputError: If the world says that it has none, or says nothing and has none.
+    """
+    said = is_differentiable(job.world)
+    if said is None:
+        said = _passes_reverse_mode(job)
+    if not said:
+        raise InputError(f"this world has no derivative, and one is needed: {remedy}.")
+
+
+def _passes_reverse_mode(job: Job) -> bool:
+    """Whether a function that does not say so has a derivative, found by tracing it."""
+    number = jnp.zeros((), job.pile.height.dtype)
+    pose, action = Pose(number, number, number), Action(number, number, number, number)
+
+    def mass(pose: Pose, action: Action) -> Array:
+        return job.world(job.pile, pose, action)[1].mass
+
+    # What is wrong with the function itself is for its author to see, as it is.
+    jax.eval_shape(mass, pose, action)
+    try:
+        jax.eval_shape(jax.grad(mass, argnums=(0, 1)), pose, action)
+    except Exception:
+        return False
+    return True

@@ -1,50 +1,36 @@
-"""Planners: where to dig, at which heading, with which action, for the next N loadings."""
+"""Planning the next loads, and playing plans."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from wlplan.engines.dem.world import DiscreteElements
-from wlplan.engines.simulator import Simulator
+from wlplan.checks import check_plan
 from wlplan.errors import InputError
-from wlplan.planning.job import Decisions, Job, Outcome, ToeJob, judged, outcomes, played
-from wlplan.planning.objective import Objective, objective_named
-from wlplan.planning.planners.gradient import GradientSettings, gradient
-from wlplan.planning.planners.search import Progress, SearchSettings, greedy, nominal
-from wlplan.planning.poses import toe_of
-from wlplan.planning.transport import Receiver, default_receiver
-from wlplan.terrain.toe import ToeContour, toe_contour
-from wlplan.types import LoadingPlan, Pile, Rollout, World
+from wlplan.planning import planners
+from wlplan.planning.job import (
+    Decisions,
+    Job,
+    PlanResult,
+    assemble,
+    assess,
+    make_job,
+    outcomes,
+    with_toe,
+)
+from wlplan.planning.objective import Objective
+from wlplan.planning.proposals import Planner, Progress, Proposals
+from wlplan.site.site import Site
+from wlplan.terrain.toe import ToeContour
+from wlplan.types import LoadingPlan, Pile, World
+from wlplan.worlds.capabilities import as_pytree, is_differentiable
 
-__all__ = [
-    "PLANNERS",
-    "GradientSettings",
-    "PlanResult",
-    "Progress",
-    "SearchSettings",
-    "judge",
-    "plan_loads",
-    "play",
-]
-
-PlanResult = Outcome
-"""A plan and what it yields and costs in the world it was played in."""
-
-_PLANNERS: dict[str, Callable[..., Decisions]] = {
-    "gradient": gradient,
-    "greedy": greedy,
-    "nominal": nominal,
-}
-PLANNERS = tuple(_PLANNERS)
-"""Names of the planners."""
-
-
-WITHOUT_GRADIENT = SearchSettings(poses_per_metre=1.0, actions=16, refine_steps=0)
-"""How the baselines search in the simulator: by trial alone."""
+# A plan that is its own limit may be above it by rounding.
+_ROUNDING = 1e-6
 
 
 def plan_loads(
@@ -52,72 +38,109 @@ def plan_loads(
     pile: Pile,
     *,
     loads: int = 15,
-    objective: str | Objective = "efficiency",
-    planner: str = "gradient",
-    receiver: Receiver | None = None,
+    objective: str | Objective | Mapping[str, Any] | Callable[..., Any] = "efficiency",
+    planner: str | Planner = "gradient",
+    site: Site | None = None,
     seed: int = 0,
     referee: World | None = None,
     progress: Progress | None = None,
-    settings: GradientSettings | SearchSettings | None = None,
     contour: ToeContour | None = None,
 ) -> PlanResult:
     """Plans the next loadings from a pile.
 
     Args:
-        world: World to plan in; differentiable for the gradient planner.
+        world: World to plan in.
         pile: The pile as it is, relaxed or as scanned.
         loads: Number of loadings.
-        objective: Name or weights.
-        planner: One of `PLANNERS`.
-        receiver: Where the loads go; default: the follow-up's place relative to the pile.
+        objective: A name, an `Objective`, a mapping of named terms, or a function of a loading.
+        planner: A name of `wlplan.planners.NAMES`, or a planner with settings of its own.
+        site: Machine, soil and receiver; default: the WA320 in gravel, and the follow-up's
+            receiver beside the pile.
         seed: Of everything random.
-        referee: World that plays the planner's best candidates, each dig at the toe of the pile
-            as the referee has it by then, and picks the cheapest; the poses of the result are the
-            ones it dug at. A candidate that `world` finds dearer than the planner's last, for the
+        referee: World that plays the planner's candidates, each dig at the toe of the pile as the
+            referee has it by then, and picks the cheapest; the poses of the result are the ones
+            it dug at. A candidate that `world` finds dearer than the planner's limit, for the
             gradient planner the greedy plan, is out. None: `world` picks, with its own poses.
         progress: Called as the planner advances.
-        settings: Of the planner; default: its own, or `WITHOUT_GRADIENT` in the simulator.
         contour: The toe to dig along; default: that of the pile.
 
     Returns:
-        The plan, its rollout in `world`, the transport, the cost, and in `refereed` how the
-        referee saw it.
+        The plan, its rollout in `world`, the transport, the terms and the cost, and in `refereed`
+        how the referee saw it.
 
     Raises:
-        InputError: If there is nothing to dig, no load is asked for, a name is unknown, or the
-            planner needs a gradient that the world does not have.
+        InputError: If there is nothing to dig, no load is asked for, a name is unknown, the
+            planner needs a gradient that the world does not have, or no plan has a finite cost.
     """
-    if planner not in _PLANNERS:
-        raise InputError(f"unknown planner {planner!r}; choose one of {', '.join(PLANNERS)}")
     if loads < 1:
-        raise InputError(f"{loads} loads were asked for; ask for at least 1")
-    job = ToeJob(
-        world=_as_pytree(world),
-        pile=pile,
-        toe=toe_of(toe_contour(pile) if contour is None else contour, pile.height.dtype),
-        receiver=default_receiver(pile) if receiver is None else receiver,
-        objective=objective_named(objective),
-    )
-    if _has_no_gradient(world):
-        if planner == "gradient":
-            raise InputError(
-                "this world plays without derivatives, which the gradient planner needs; "
-                "plan in a model, or use the greedy or the nominal planner"
-            )
-        settings = WITHOUT_GRADIENT if settings is None else settings
-    options: dict[str, Any] = {} if settings is None else {"settings": settings}
-    candidates = _PLANNERS[planner](job, loads, seed=seed, progress=progress, **options)
+        raise InputError(f"{loads} loads were asked for: ask for at least 1.")
+    job = with_toe(make_job(world, pile, site=site, objective=objective), contour)
+    chosen = planner_of(planner, job.world)
+    proposals = chosen.propose(job, loads, seed=seed, progress=progress)
     if referee is None:
-        seen = outcomes(job, candidates)
-        return _member(seen, int(np.nanargmin(np.asarray(seen.cost))))
+        return choose(job, proposals)
+    return choose(job, proposals, referee=make_job(referee, pile, site=site).world)
+
+
+def planner_of(planner: str | Planner, world: World) -> Planner:
+    """The planner that is meant by a name, with the settings that suit a world; or itself.
+
+    Raises:
+        InputError: If the name is unknown, or the value is no planner.
+    """
+    if isinstance(planner, str):
+        if planner not in planners.NAMES:
+            raise InputError(
+                f"unknown planner {planner!r}: choose one of {', '.join(planners.NAMES)}."
+            )
+        kind = getattr(planners, planners.class_name(planner))
+        by_trial = getattr(kind, "by_trial", kind)
+        return by_trial() if is_differentiable(world) is False else kind()
+    if isinstance(planner, type) or not callable(getattr(planner, "propose", None)):
+        raise InputError(
+            f"{planner!r} is no planner: give a name, or an object with "
+            f"propose(job, loads, *, seed, progress), such as wlplan.planners.Greedy()."
+        )
+    return planner
+
+
+def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> PlanResult:
+    """The cheapest of a planner's candidates that is not dearer than its limit.
+
+    Args:
+        job: What was planned for, in the world that planned.
+        proposals: What the planner handed over.
+        referee: Who picks; None: the job's own world.
+
+    Raises:
+        InputError: If no plan has a finite cost.
+    """
+    rows = _rows(proposals)
+    judged = outcomes(job if referee is None else job.replace(world=as_pytree(referee)), rows)
     # The toe is where the referee's pile begins, so the poses are the ones it was played with.
-    judged = outcomes(job.replace(world=_as_pytree(referee)), candidates)
-    seen = played(Job(job.world, pile, job.receiver, job.objective), judged.plan)
+    seen = judged if referee is None else outcomes(job, judged.plan)
     costs = np.asarray(seen.cost)
-    # Rounding may put a plan that is its own limit above it.
-    allowed = costs <= costs[-1] * (1.0 + 1e-6)
-    winner = int(np.nanargmin(np.where(allowed, np.asarray(judged.cost), np.inf)))
-    return _member(seen, winner).replace(refereed=_member(judged, winner))
+    allowed = np.isfinite(np.asarray(judged.cost))
+    if proposals.limit is not None and np.isfinite(costs[-1]):
+        allowed &= costs <= costs[-1] * (1.0 + _ROUNDING)
+    if not allowed.any():
+        raise InputError(
+            "no plan has a finite cost: check the pile for spikes, and the terms of the objective."
+        )
+    winner = int(np.argmin(np.where(allowed, np.asarray(judged.cost), np.inf)))
+    result = _member(seen, winner)
+    return result if referee is None else result.replace(refereed=_member(judged, winner))
+
+
+def _rows(proposals: Proposals) -> Decisions | LoadingPlan:
+    """All that may be picked, leaves [K, N]: the candidates, and the limit as the last."""
+    candidates, limit = proposals
+    # The first leaf of either kind is one number a loading.
+    if jnp.ndim(jax.tree.leaves(candidates)[0]) == 1:
+        candidates = jax.tree.map(lambda leaf: leaf[None], candidates)
+    if limit is None:
+        return candidates
+    return jax.tree.map(lambda all_, one: jnp.concatenate([all_, one[None]]), candidates, limit)
 
 
 def play(
@@ -125,8 +148,10 @@ def play(
     pile: Pile,
     plan: LoadingPlan,
     *,
-    objective: str | Objective = "efficiency",
-    receiver: Receiver | None = None,
+    objective: str | Objective | Mapping[str, Any] | Callable[..., Any] = "efficiency",
+    site: Site | None = None,
+    note: Callable[[str], None] = lambda text: None,
+    record: Callable[[int, Any], None] = lambda number, record: None,
 ) -> PlanResult:
     """Plays a fixed plan in a world, for instance one planned in a model in the simulator.
 
@@ -134,57 +159,40 @@ def play(
         world: World to play in.
         pile: The pile before the first loading.
         plan: Poses and actions.
-        objective: Name or weights.
-        receiver: Where the loads go; default: the follow-up's place relative to the pile.
+        objective: As for `plan_loads`.
+        site: Machine, soil and receiver, as for `plan_loads`.
+        note: Called with what is worth knowing, by worlds that play load by load.
+        record: `record(number, record)`, called after each loading, counted from 1, by worlds
+            that play load by load, with what they record of it.
+
+    Raises:
+        InputError: If the world is a name, the plan makes no sense, or a height is not finite.
     """
-    job = Job(
-        world=_as_pytree(world),
-        pile=pile,
-        receiver=default_receiver(pile) if receiver is None else receiver,
-        objective=objective_named(objective),
-    )
-    return _member(played(job, jax.tree.map(lambda leaf: leaf[None], plan)), 0)
+    check_plan(plan)
+    job = make_job(world, pile, site=site, objective=objective)
+    if hasattr(job.world, "play_load"):
+        return _play_load_by_load(job, plan, note, record)
+    plan = jax.tree.map(lambda leaf: jnp.asarray(leaf, pile.height.dtype)[None], plan)
+    return _member(outcomes(job, plan), 0)
 
 
-def judge(
-    outcome: Rollout,
-    pile: Pile,
+def _play_load_by_load(
+    job: Job,
     plan: LoadingPlan,
-    *,
-    objective: str | Objective = "efficiency",
-    receiver: Receiver | None = None,
+    note: Callable[[str], None],
+    record: Callable[[int, Any], None],
 ) -> PlanResult:
-    """What a plan costs that was played elsewhere, load by load.
-
-    Args:
-        outcome: What came of it.
-        pile: The pile before the first loading.
-        plan: Poses and actions.
-        objective: Name or weights.
-        receiver: Where the loads go; default: the follow-up's place relative to the pile.
-    """
-    return _judged(
-        default_receiver(pile) if receiver is None else receiver,
-        objective_named(objective),
-        plan,
-        outcome,
-    )
+    for text in getattr(job.world, "notes", list)():
+        note(text)
+    pile, loadings, play_one = job.pile, [], cast(Any, job.world).play_load
+    for n in range(len(plan.pose.x)):
+        pose, action = jax.tree.map(lambda leaf, n=n: leaf[n], (plan.pose, plan.action))
+        after, performance, what = play_one(pile, pose, action, note)
+        loadings.append(assess(job, pile, pose, action, performance))
+        pile = after
+        record(n + 1, what)
+    return assemble(jax.tree.map(lambda *leaves: jnp.stack(leaves), *loadings), pile)
 
 
-_judged = jax.jit(judged, static_argnums=1)
-
-
-def _has_no_gradient(world: World) -> bool:
-    if isinstance(world, DiscreteElements):
-        return True
-    return isinstance(world, Simulator) and not world.settings.differentiable
-
-
-def _member(batch: Outcome, k: int) -> Outcome:
+def _member(batch: PlanResult, k: int) -> PlanResult:
     return jax.tree.map(lambda leaf: leaf[k], batch)
-
-
-def _as_pytree(world: World) -> World:
-    """A world that can be passed to a jitted function: plain functions become a static leaf."""
-    leaves = jax.tree.leaves(world)
-    return jax.tree_util.Partial(world) if any(callable(leaf) for leaf in leaves) else world

@@ -16,15 +16,14 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from wlplan.site.machine import WA320, WheelLoader
 from wlplan.terrain.heightmap import sample, to_world
-from wlplan.terrain.toe import ToeContour
+from wlplan.terrain.toe import TOE_RISE, ToeContour, check_accessible
 from wlplan.types import Pile, Pose
 
 # Largest heading offset from the inward normal [rad]; the training data have 10 degrees and the
 # contour's own noise adds to that.
 MAX_OFFSET = math.radians(15.0)
-# Rise over the ground that counts as the toe [m], the level of `pile.toe_contour`.
-TOE_RISE = 0.15
 
 # The pile may have bulged out over its old toe, and may have been taken back this far [m].
 _FROM, _TO, _STEP = -2.0, 9.0, 0.1
@@ -32,8 +31,8 @@ _FROM, _TO, _STEP = -2.0, 9.0, 0.1
 _GAP = 0.5
 # Points of a toe come in multiples of so many.
 _BLOCK = 1024
-# The toe is where the mean over these lines across the bucket rises [m].
-_ACROSS = (-0.9, -0.45, 0.0, 0.45, 0.9)
+# The toe is where the mean over these lines across the bucket rises, in parts of its width.
+_ACROSS = (-1.0 / 3.0, -1.0 / 6.0, 0.0, 1.0 / 6.0, 1.0 / 3.0)
 
 
 @no_type_check
@@ -48,15 +47,22 @@ class Toe(struct.PyTreeNode):
     direction: Float[Array, "n 2"]  # unit vector into the pile
     count: Int[Array, ""]  # points without the repeated ones
     closed: Bool[Array, ""]
+    width: float = struct.field(pytree_node=False)  # of the bucket [m]
 
 
-def toe_of(contour: ToeContour, dtype: np.dtype | type = np.float32) -> Toe:
+def toe_of(
+    contour: ToeContour, machine: WheelLoader = WA320, dtype: np.dtype | type = np.float32
+) -> Toe:
     """The arrays of a contour; only where it is accessible.
 
     If part of it is not, the rest is an open path that begins after the longest gap; positions in
     the other gaps go to the nearer side.
+
+    Raises:
+        InputError: If no part of it is.
     """
     accessible = np.asarray(contour.accessible)
+    check_accessible(accessible)
     points, heading = np.asarray(contour.points), np.asarray(contour.heading)
     closed = bool(contour.closed) and bool(accessible.all())
     if not closed and contour.closed:
@@ -75,6 +81,7 @@ def toe_of(contour: ToeContour, dtype: np.dtype | type = np.float32) -> Toe:
         direction=jnp.asarray(np.stack([np.cos(heading), np.sin(heading)], axis=1), dtype),
         count=jnp.asarray(count, jnp.int32),
         closed=jnp.asarray(closed),
+        width=machine.bucket_width,
     )
 
 
@@ -102,18 +109,18 @@ def pose_at(toe: Toe, pile: Pile, position: Float[Array, ""], offset: Float[Arra
     into = (1.0 - part) * toe.direction[low] + part * toe.direction[high]
     heading = jnp.arctan2(into[1], into[0]) + MAX_OFFSET * jnp.tanh(offset)
     anchor = Pose(x=point[0], y=point[1], heading=heading)
-    x, y = to_world(anchor, distance_to_toe(pile, anchor), jnp.zeros_like(heading))
+    x, y = to_world(anchor, distance_to_toe(pile, anchor, width=toe.width), jnp.zeros_like(heading))
     return Pose(x=x, y=y, heading=heading)
 
 
-def distance_to_toe(pile: Pile, pose: Pose) -> Float[Array, ""]:
+def distance_to_toe(pile: Pile, pose: Pose, *, width: float) -> Float[Array, ""]:
     """Distance along the heading to where the pile begins, over the width of a bucket [m].
 
     Zero if there is no pile on the way.
     """
     dtype = pile.height.dtype
     along = jnp.arange(_FROM, _TO, _STEP, dtype=dtype)
-    across = jnp.asarray(_ACROSS, dtype)
+    across = jnp.asarray(width * np.array(_ACROSS), dtype)
     points = to_world(pose, *jnp.meshgrid(along, across, indexing="ij"))
     rise = sample(pile.height - pile.floor, pile, *points).mean(axis=1)
     reached = rise >= TOE_RISE

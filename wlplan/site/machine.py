@@ -24,6 +24,8 @@ class WheelLoader:
     travel_speed: float = parameter(8.0 / 3.6, 1.0, 5.0, "m/s")
     # Distance from the dig location at which a cycle starts and ends [m]. Paper, section 5.2.
     approach_distance: float = parameter(5.0, MAP_BEHIND, 50.0, "m")
+    # Turning radius at the outside of the tyres [m]. Brochure of the class: 5.2 to 5.5.
+    turning_radius: float = parameter(5.4, 1.0, 30.0, "m")
     # Tyre friction on firm gravel [1]. Estimate, 0.6 to 0.75 in the literature.
     # Range: apart from the rolling resistance, which the thrust has to overcome.
     traction: float = parameter(0.6, 0.3, 1.5, "")

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
-from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
-from wlplan.planning.job import Job, play_plan, played
-from wlplan.terrain.toe import toe_contour
-from wlplan.types import LoadingPlan, Pile, Pose, World, action_from, action_vector
+from wlplan.planning.job import Job, check_has_gradient, outcomes, play_candidate
+from wlplan.terrain.toe import ToeContour, check_accessible, toe_contour
+from wlplan.types import LoadingPlan, Pile, Pose, action_from, action_vector
+from wlplan.worlds.capabilities import with_derivatives
 
 COMPONENTS = ("x", "y", "heading", "delta_bm", "k_bm", "delta_bk", "k_bk")
 """Components of one loading: those of its pose, then those of its action."""
@@ -106,23 +106,25 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def random_plan(pile: Pile, loads: int, *, seed: int) -> LoadingPlan:
+def random_plan(
+    pile: Pile, loads: int, *, seed: int, contour: ToeContour | None = None
+) -> LoadingPlan:
     """A plan to check: neighbouring digs along the toe, actions in the middle of their box.
 
     Args:
         pile: The pile before the first loading.
         loads: Number of loadings.
         seed: Of the first dig location, the headings and the actions.
+        contour: Toe of the pile where it is known already.
 
     Raises:
         InputError: If no load is asked for, there is nothing to dig, or a bucket can start nowhere.
     """
     if loads < 1:
         raise InputError(f"{loads} loads were asked for; ask for at least 1")
-    contour = toe_contour(pile)
+    contour = toe_contour(pile) if contour is None else contour
+    check_accessible(contour.accessible)
     accessible = np.flatnonzero(contour.accessible)
-    if not accessible.size:
-        raise InputError("no point of the toe is accessible: leave ground around the pile.")
     rng = np.random.default_rng(seed)
     first = rng.integers(accessible.size)
     spots = accessible[(first + _POINTS_APART * np.arange(loads)) % accessible.size]
@@ -144,16 +146,9 @@ def plan_from(table: Float[np.ndarray, "*n 7"]) -> LoadingPlan:
     return LoadingPlan(Pose(*(columns[..., k] for k in range(3))), action_from(columns[..., 3:]))
 
 
-def differentiable(world: World) -> World:
-    """The world with reverse-mode derivatives: for the simulator, its setting that has them."""
-    if not isinstance(world, Simulator):
-        return world
-    return world.replace(settings=dataclasses.replace(world.settings, differentiable=True))
-
-
 def cost_and_gradient(job: Job, plan: LoadingPlan) -> tuple[Float[Array, ""], LoadingPlan]:
     """Cost of a plan with its poses as they are, and its gradient, a pytree like the plan."""
-    return jax.value_and_grad(lambda plan: play_plan(job, plan).cost)(plan)
+    return jax.value_and_grad(lambda plan: play_candidate(job, plan, report=False).cost)(plan)
 
 
 _cost_and_gradient = jax.jit(cost_and_gradient)
@@ -174,8 +169,8 @@ def check_gradient(
     differences disagree by more than half of the error, and not just because the cost is curved.
 
     Args:
-        job: World, pile, receiver and objective. The simulator is taken with its differentiable
-            setting; any other world has to be a pytree that passes reverse mode.
+        job: World, pile, site and objective. A world that has several forms is taken in the one
+            that has derivatives.
         plan: N loadings.
         step: Of the differences, in m, rad or the unit of the action parameter.
         tolerance: Largest error, relative to the larger of the two values or to a thousandth of
@@ -183,13 +178,15 @@ def check_gradient(
         progress: Called with the number of comparisons made, and of all to be made so far.
 
     Raises:
-        InputError: If step or tolerance are not positive, or the cost is not finite.
+        InputError: If step or tolerance are not positive, the world has no derivative, or the cost
+            is not finite.
     """
     for name, value in (("step", step), ("tolerance", tolerance)):
         if not 0.0 < value < math.inf:
             raise InputError(f"the {name} is {value:g}: it has to be positive.")
     with jax.enable_x64(True):
-        job = jax.tree.map(_widened, job.replace(world=differentiable(job.world)))
+        job = jax.tree.map(_widened, job.replace(world=with_derivatives(job.world)))
+        check_has_gradient(job, "check another world")
         plan = jax.tree.map(_widened, plan)
         if progress is not None:
             progress(0, as_table(plan).size)
@@ -303,4 +300,4 @@ class _Comparison:
         return _Compared(step, central, error if math.isfinite(error) else math.inf, bend)
 
     def _costs_of(self, tables: Float[np.ndarray, "k n 7"]) -> Float[np.ndarray, "k n"]:
-        return np.asarray(played(self._job, plan_from(tables)).costs)
+        return np.asarray(outcomes(self._job, plan_from(tables)).costs)

@@ -63,9 +63,15 @@ def strip_of(pile: Pile, pose: Pose, *, width: float) -> Strip:
     return Strip(weight, above, along)
 
 
-def excavate(
-    pile: Pile, pose: Pose, volume: Float[Array, ""], *, width: float
-) -> tuple[Pile, Float[Array, ""]]:
+class Excavation(NamedTuple):
+    """A pile that a volume was taken out of, and how that ended."""
+
+    pile: Pile  # not relaxed
+    volume: Float[Array, ""]  # what was asked for, or all that the strip holds [m^3]
+    missing: Float[Array, ""]  # what of it could not be found; rounding if it converged [m^3]
+
+
+def excavate(pile: Pile, pose: Pose, volume: Float[Array, ""], *, width: float) -> Excavation:
     """Takes a volume out of the strip in front of a dig pose.
 
     Args:
@@ -75,8 +81,8 @@ def excavate(
         width: Width of the bucket [m].
 
     Returns:
-        The pile afterwards (not relaxed) and the volume that was taken [m^3]: `volume`, or less
-        if the strip does not hold that much.
+        The pile afterwards (not relaxed), the volume that was taken, `volume` or less if the
+        strip does not hold that much, and how well the solution meets it.
     """
     cell_area = pile.cell_size**2
     strip = strip_of(pile, pose, width=width)
@@ -118,4 +124,5 @@ def excavate(
     penetration = newton(penetration, strip, wanted)
     # What rounding leaves over is met by scaling the cut.
     removed = take(cut(penetration, strip), strip.weight * strip.above, wanted)
-    return pile.replace(height=pile.height - removed), wanted * cell_area
+    missing = lax.stop_gradient(wanted - removed.sum()) * cell_area
+    return Excavation(pile.replace(height=pile.height - removed), wanted * cell_area, missing)

@@ -148,7 +148,7 @@ def add_local_change(
     pose: Pose,
     change: Float[Array, "n n"],
     displacement: float,
-) -> Float[Array, "nx ny"]:
+) -> tuple[Float[Array, "nx ny"], Float[Array, ""]]:
     """Writes a change of the local heightmap back to the grid, mass exact.
 
     The change is interpolated at the cells of the grid. Losses and gains are scaled, each by a
@@ -161,6 +161,9 @@ def add_local_change(
         pose: Pose of the local frame.
         change: Change of the local heightmap [m].
         displacement: How far the local map begins before the dig location [m].
+
+    Returns:
+        The surface after [m], and what was to be lost and is not, for want of soil [m^3].
     """
     n = change.shape[0]
     # The map reaches half a diagonal on either side of its middle, wherever it is turned to.
@@ -186,7 +189,8 @@ def add_local_change(
     gain = jnp.maximum(on_grid, 0.0)
     total = gain.sum()
     scale = jnp.where(total > 0.0, gained / jnp.where(total > 0.0, total, 1.0), 0.0)
-    return lax.dynamic_update_slice(height, surface - loss + scale * gain, start)
+    missing = lax.stop_gradient(lost - loss.sum()) * window.cell_size**2
+    return lax.dynamic_update_slice(height, surface - loss + scale * gain, start), missing
 
 
 def take(

@@ -13,7 +13,6 @@ from jaxtyping import Bool, Complex, Float, Int
 from scipy import ndimage
 
 from wlplan.errors import InputError
-from wlplan.site.machine import WA320
 
 # Smallest pile that is worth a bucket [m^3], a third of a heaped one.
 _SMALLEST_VOLUME = 1.0
@@ -25,6 +24,7 @@ def largest_outline(
     rise: float,
     origin: Float[np.ndarray, "2"],
     cell: float,
+    width: float,
 ) -> Complex[np.ndarray, " _"]:
     """The longest line, inside the map, around the largest pile by volume, without its hollows.
 
@@ -33,6 +33,7 @@ def largest_outline(
         rise: Height above the ground that counts as pile [m].
         origin: World position of the first cell [m].
         cell: Grid spacing [m].
+        width: Of the bucket [m]: a pile that is narrower in every direction does not count.
 
     Returns:
         Points of the line; one that does not run over the edge of the map ends where it begins.
@@ -51,9 +52,9 @@ def largest_outline(
         )
     x, y = (origin[k] + cell * np.arange(part[k].start, part[k].stop) for k in (0, 1))
     lines = _level_lines(near, x, y, rise)
-    if not _is_one_pile(lines, near, higher, cell):
+    if not _is_one_pile(lines, near, higher, cell, width):
         # Most piles are one, and to see that takes less time than to look for the largest.
-        lines = _level_lines(_largest_alone(near, higher, rise, cell), x, y, rise)
+        lines = _level_lines(_largest_alone(near, higher, rise, cell, width), x, y, rise)
     return max(lines, key=lambda line: distances_along(line)[-1])
 
 
@@ -103,6 +104,7 @@ def _is_one_pile(
     above: Float[np.ndarray, "n m"],
     higher: Bool[np.ndarray, "n m"],
     cell: float,
+    width: float,
 ) -> bool:
     """Whether level lines are for certain the edge of a single pile that is worth digging."""
     if len(lines) != 1 or lines[0][0] != lines[0][-1] or higher[0, 0]:
@@ -112,11 +114,15 @@ def _is_one_pile(
     if (one[:, :-1] & one[:, 1:] & other[:-1] & other[1:]).any():
         return False
     size = cell * (max(higher.shape) - 2)
-    return size >= WA320.bucket_width and bool(above[higher].sum() * cell**2 >= _SMALLEST_VOLUME)
+    return size >= width and bool(above[higher].sum() * cell**2 >= _SMALLEST_VOLUME)
 
 
 def _largest_alone(
-    above: Float[np.ndarray, "n m"], higher: Bool[np.ndarray, "n m"], rise: float, cell: float
+    above: Float[np.ndarray, "n m"],
+    higher: Bool[np.ndarray, "n m"],
+    rise: float,
+    cell: float,
+    width: float,
 ) -> Float[np.ndarray, "n m"]:
     """The surface with all piles but the largest sunk, and its hollows filled, to about the level.
 
@@ -127,12 +133,12 @@ def _largest_alone(
     volumes = np.bincount(labels.ravel(), weights=above.ravel())[1:] * cell**2
     largest = labels == 1 + int(np.argmax(volumes))
     extent = cell * max(side.stop - side.start - 2 for side in _bounds(largest))
-    if extent < WA320.bucket_width:
+    if extent < width:
         extent = _largest_extent(np.argwhere(largest) * cell) + cell
-    if volumes.max() < _SMALLEST_VOLUME or extent < WA320.bucket_width:
+    if volumes.max() < _SMALLEST_VOLUME or extent < width:
         raise InputError(
             f"Nothing to dig: the largest pile holds {volumes.max():.2g} m^3 and is {extent:.2g} m "
-            f"long; a bucket needs {_SMALLEST_VOLUME:g} m^3 and {WA320.bucket_width:g} m."
+            f"long; a bucket needs {_SMALLEST_VOLUME:g} m^3 and {width:g} m."
         )
     # What is outside is in one piece, unless there are hollows or the pile runs over the edge.
     solid = largest if ndimage.label(~largest)[1] == 1 else ndimage.binary_fill_holes(largest)

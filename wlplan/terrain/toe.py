@@ -9,16 +9,17 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 from scipy import ndimage
 
+from wlplan.checks import check_pile
 from wlplan.errors import InputError
-from wlplan.site.machine import WA320
+from wlplan.site.machine import WA320, WheelLoader
 from wlplan.terrain.outlines import distances_along, largest_outline
-from wlplan.types import Pile
+from wlplan.types import Pile, Pose
+
+TOE_RISE = 0.15
+"""Rise over the ground that counts as the toe [m]."""
 
 # Spacing of the points of a toe contour [m].
 _CONTOUR_SPACING = 0.1
-# Distance ahead of the toe at which there must still be pile for a point to count [m]: the length
-# of the bucket floor.
-_AHEAD = WA320.bucket_depth
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +33,7 @@ class ToeContour:
     accessible: Bool[np.ndarray, " n"]  # a bucket can start here on ground that the scan saw
 
 
-def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
+def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA320) -> ToeContour:
     """Trace the toe of the largest pile, by volume, on the grid.
 
     The toe is where the surface stands `rise` above the ground. Hollows inside the pile are not
@@ -45,6 +46,7 @@ def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
     Args:
         pile: One pile, not a batch.
         rise: Height above the ground that counts as pile [m].
+        machine: What digs: a bucket has to fit, and to find pile over the length of its floor.
 
     Raises:
         InputError: If there is nothing to dig: no cell higher than `rise`, less than 1 m^3, or a
@@ -53,11 +55,10 @@ def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
     if not 0.0 < rise < math.inf:
         raise InputError(f"The rise is {rise:g} m: it has to be positive.")
     cell = pile.cell_size
-    above = np.asarray(pile.height, np.float64)
-    if pile.ground is not None:
-        above = above - np.asarray(pile.ground, np.float64)
+    check_pile(pile)
+    above = np.asarray(pile.height, np.float64) - np.asarray(pile.floor, np.float64)
     origin = np.asarray(pile.origin, np.float64)
-    line = largest_outline(above, rise=rise, origin=origin, cell=cell)
+    line = largest_outline(above, rise=rise, origin=origin, cell=cell, width=machine.bucket_width)
     closed = bool(line[0] == line[-1]) and len(line) > 2
 
     marks = distances_along(line)
@@ -72,7 +73,7 @@ def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
     at = np.linspace(0.0, length, count, endpoint=not closed)
     points = along(at)
     # Chords over one bucket width smooth out ripples.
-    half = 0.5 * min(WA320.bucket_width, 0.5 * length)
+    half = 0.5 * min(machine.bucket_width, 0.5 * length)
     chord = along(at + half) - along(at - half)
     normal = 1j * chord / np.maximum(np.abs(chord), 1e-9)
     if closed:
@@ -84,17 +85,30 @@ def toe_contour(pile: Pile, *, rise: float = 0.15) -> ToeContour:
     if not left:
         points, normal = points[::-1], -normal[::-1]
 
-    edge = 0.5j * WA320.bucket_width * normal
+    edge = 0.5j * machine.bucket_width * normal
     accessible = (
         _inside(points - edge, pile.height.shape, origin, cell)
         & _inside(points + edge, pile.height.shape, origin, cell)
-        & (_sample(above, points + _AHEAD * normal, origin, cell) > rise)
+        & (_sample(above, points + machine.bucket_depth * normal, origin, cell) > rise)
     )
     if pile.valid is not None:
         seen = np.asarray(pile.valid, np.float64)
         accessible &= _sample(seen, points, origin, cell) > 1.0 - 1e-6
     pairs = np.stack([points.real, points.imag], axis=-1)
     return ToeContour(pairs, np.angle(normal), length, closed, accessible)
+
+
+def check_accessible(accessible: Bool[np.ndarray, " n"]) -> None:
+    """Refuses a toe that a bucket can start nowhere on.
+
+    Raises:
+        InputError: If no point of it is accessible.
+    """
+    if not np.any(accessible):
+        raise InputError(
+            "A bucket can start nowhere on the toe of this pile: it lies on unseen ground or at "
+            "the edge of the map; scan a wider area around the pile."
+        )
 
 
 def evenly_spaced(contour: ToeContour, n: int) -> Int[np.ndarray, " n"]:
@@ -110,6 +124,47 @@ def evenly_spaced(contour: ToeContour, n: int) -> Int[np.ndarray, " n"]:
             f"ask for 1 to {candidates.size}."
         )
     return candidates[((np.arange(n) + 0.5) * candidates.size / n).astype(int)]
+
+
+def edge_poses(contour: ToeContour, locations: int) -> Pose:
+    """Poses evenly spaced by arc length over the accessible part of a toe, heading inward.
+
+    Args:
+        contour: Toe of a pile.
+        locations: Number of poses; more than the contour has points are interpolated.
+
+    Raises:
+        InputError: If the number is not positive, or no point of the contour is accessible.
+    """
+    if locations < 1:
+        raise InputError(f"{locations} dig locations asked for: ask for at least one.")
+    check_accessible(contour.accessible)
+    points = np.flatnonzero(contour.accessible)
+    # Every accessible point stands for one step of the contour, half before it and half after.
+    place = (np.arange(locations) + 0.5) * points.size / locations
+    nearest = points[np.floor(place).astype(int)]
+    offset = place % 1.0 - 0.5
+    neighbour = nearest + np.where(offset < 0.0, -1, 1)
+    count = len(contour.heading)
+    neighbour = neighbour % count if contour.closed else np.clip(neighbour, 0, count - 1)
+    weight = np.where(contour.accessible[neighbour], np.abs(offset), 0.0)
+
+    def between(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+        return (1.0 - weight) * values[nearest] + weight * values[neighbour]
+
+    heading = np.arctan2(between(np.sin(contour.heading)), between(np.cos(contour.heading)))
+    # Between two points of an open contour's ends, or of a cusp, the headings may cancel.
+    smooth = np.abs(_turn(contour.heading[nearest], contour.heading[neighbour])) < 0.5 * math.pi
+    return Pose(
+        x=between(contour.points[:, 0]),
+        y=between(contour.points[:, 1]),
+        heading=np.where(smooth, heading, contour.heading[nearest]),
+    )
+
+
+def _turn(start: Float[np.ndarray, " n"], end: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Angle from one heading to another [rad], -pi to pi."""
+    return (end - start + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def _inside(

@@ -1,1 +1,1 @@
-"""Worlds by name."""
+"""Worlds: what they say they can do, the learned ones, and all of them by name."""

@@ -4,193 +4,18 @@ from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
-from typing import Any, no_type_check
+from typing import Any
 
-import jax.numpy as jnp
-from flax import struct
-from jaxtyping import Array, Float
-
-from wlplan.constants import KG_PER_TONNE
-from wlplan.engines.dem.world import DiscreteElements
-from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
-from wlplan.models.ensemble import Ensemble
-from wlplan.models.height_change import HeightChangeModel
-from wlplan.models.performance import PerformanceModel
-from wlplan.models.performance_high import HighPerformanceModel
-from wlplan.models.pile_state import PileStateModel
 from wlplan.models.storage import load_model, read_description
+from wlplan.plugins import load_object
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.presets import check_machine, check_soil
 from wlplan.site.soil import GRAVEL, Soil
-from wlplan.terrain.automaton import DEFAULT_SCHEDULE, Schedule, settle_dug, window_of
-from wlplan.terrain.automaton.windows import paste
-from wlplan.terrain.characteristics import as_vector, characteristics
-from wlplan.terrain.excavation import excavate
-from wlplan.terrain.heightmap import (
-    STATE_CELLS,
-    STATE_DISPLACEMENT,
-    add_local_change,
-    local_points,
-    sample,
-    sample_local,
-)
-from wlplan.types import Action, LocalHeightmap, Performance, Pile, Pose, World, action_vector
-
-WORLDS = ("low", "high", "hybrid", "simulator")
-"""Names that `load_world` knows, to plan in."""
-ENGINES = ("simulator", "dem")
-"""Names that `load_world` knows, to play plans in; "dem" is too slow to plan in."""
-
-MODELS = {"low": ("psi_low",), "hybrid": ("psi_high",), "high": ("psi_high", "phi")}
-"""The models of each learned world, by the names under which they ship."""
-
-
-@no_type_check
-class LowWorld(struct.PyTreeNode):
-    """The low-dimensional world: ψ_low, mass removal along the strip, automaton. Paper, 4.6."""
-
-    model: PerformanceModel | Ensemble
-    machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
-    soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
-    schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
-
-    def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
-        """The pile and the performance after one loading.
-
-        Where the strip holds less than the model predicts, the load is what is there.
-        """
-        predicted = self.model(self._view(pile, pose), action_vector(action))
-        return _dug_and_settled(self, pile, pose, predicted)
-
-    def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
-        """Standard deviation of what the performance is off, see `_deviation`."""
-        return _deviation(self.model, self._view(pile, pose), action)
-
-    def _view(self, pile: Pile, pose: Pose) -> Float[Array, "4"]:
-        return as_vector(characteristics(sample_local(pile, pose)))
-
-
-@no_type_check
-class HybridWorld(struct.PyTreeNode):
-    """The hybrid world: ψ_high, mass removal along the strip, automaton. Paper, 4.6."""
-
-    model: HighPerformanceModel | Ensemble
-    machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
-    soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
-    schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
-
-    def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
-        """The pile and the performance after one loading.
-
-        Where the strip holds less than the model predicts, the load is what is there.
-        """
-        predicted = self.model(sample_local(pile, pose), action_vector(action))
-        return _dug_and_settled(self, pile, pose, predicted)
-
-    def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
-        """Standard deviation of what the performance is off, see `_deviation`."""
-        return _deviation(self.model, sample_local(pile, pose), action)
-
-
-@no_type_check
-class HighWorld(struct.PyTreeNode):
-    """The high-dimensional world: ψ_high and φ. Paper, section 4.6.
-
-    With φ of ours exactly the mass that it reports leaves the pile. φ of the paper changes the pile
-    by whatever volume it predicts, and the mass is that of ψ_high.
-
-    With `settle` the automaton lets the predicted surface slide, which keeps its volume: a pile
-    that was within the schedule's tolerance of the angle of repose is so afterwards. Over 8
-    held-out rollouts of 30 loads that takes 71 ms in place of 29, and leaves a pile that differs
-    from the simulator's by 3.0 m³ in place of 6.6, at most 33° steep in place of 83°.
-    """
-
-    model: HighPerformanceModel | Ensemble
-    pile_state: HeightChangeModel | PileStateModel
-    machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
-    soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
-    schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
-    settle: bool = struct.field(pytree_node=False, default=True)
-
-    def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
-        """The pile and the performance after one loading.
-
-        Where there is less than the model predicts, the load is what is there.
-        """
-        vector = action_vector(action)
-        predicted = self.model(sample_local(pile, pose), vector)
-        local = sample_local(pile, pose, cells=STATE_CELLS, displacement=STATE_DISPLACEMENT)
-        window, start = window_of(pile, pose)
-        per_volume = self.soil.density / KG_PER_TONNE
-        exact = isinstance(self.pile_state, HeightChangeModel)
-        if isinstance(self.pile_state, HeightChangeModel):
-            volume = predicted.mass / per_volume
-            ground = local.height - _above_floor(pile, pose)
-            change = self.pile_state(local, vector, volume, ground)
-        else:
-            change = self.pile_state(local, vector) - local.height
-        height = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
-        if self.settle:
-            after = settle_dug(
-                pile,
-                height,
-                start,
-                repose_angle=self.soil.repose_angle,
-                schedule=self.schedule,
-            )
-        else:
-            after = pile.replace(height=paste(pile.height, height, jnp.stack(start)))
-        if exact:
-            left = (window.height - height).sum() * pile.cell_size**2
-            predicted = predicted.replace(mass=left * per_volume)
-        return after, predicted
-
-    def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
-        """Standard deviation of what the performance is off, see `_deviation`."""
-        return _deviation(self.model, sample_local(pile, pose), action)
-
-
-def _deviation(
-    model: PerformanceModel | HighPerformanceModel | Ensemble,
-    view: Float[Array, "4"] | LocalHeightmap,
-    action: Action,
-) -> Performance:
-    """Standard deviation of what a predicted performance is off [tonne, s, kJ].
-
-    It is that of one loading on the pile as given, whatever came before, and of what the model
-    predicts: where less is there to be loaded, it does not shrink. Differentiable.
-
-    Raises:
-        InputError: If the model is no ensemble.
-    """
-    if not isinstance(model, Ensemble):
-        raise InputError(
-            "the model of this world is a single one and does not tell how far it may be off: "
-            "train an ensemble with `wlplan train --members 5`"
-        )
-    return model.with_deviation(view, action_vector(action))[1]
-
-
-def _above_floor(pile: Pile, pose: Pose) -> Float[Array, "52 52"]:
-    """Height of the pile over its floor, on the cells of the local map of the pile state [m]."""
-    points = local_points(pose, STATE_CELLS, STATE_DISPLACEMENT, pile.height.dtype)
-    return sample(pile.height - pile.floor, pile, *points)
-
-
-def _dug_and_settled(
-    world: LowWorld | HybridWorld, pile: Pile, pose: Pose, predicted: Performance
-) -> tuple[Pile, Performance]:
-    """Takes the predicted mass out of the strip in front of the bucket and lets the rest slide."""
-    window, start = window_of(pile, pose)
-    per_volume = world.soil.density / KG_PER_TONNE
-    dug, volume = excavate(
-        window, pose, predicted.mass / per_volume, width=world.machine.bucket_width
-    )
-    after = settle_dug(
-        pile, dug.height, start, repose_angle=world.soil.repose_angle, schedule=world.schedule
-    )
-    return after, predicted.replace(mass=volume * per_volume)
+from wlplan.types import World
+from wlplan.worlds.learned import LearnedWorld
+from wlplan.worlds.names import WORLDS
+from wlplan.worlds.pile_states import Strip
 
 
 def pretrained_path(name: str) -> Path:
@@ -212,8 +37,9 @@ def load_world(
         name: "low" (ψ_low and the automaton), "hybrid" (ψ_high and the automaton), "high" (ψ_high
             and φ) or "simulator". "dem" is the discrete-element engine, which takes minutes a
             loading, has no derivative, and needs `pip install 'wlplan[dem]'`.
-        model: Directory of a trained ψ to use in place of the one that ships.
-        pile_state: For "high", directory of a trained φ, of either kind, likewise.
+        model: Directory of a trained ψ, of either kind, instead of the one that ships.
+        pile_state: Directory of a trained φ, of either kind, instead of the one that ships, or of
+            the strip and the automaton.
         soil: What is dug. A learned world takes from it the density, by which it turns mass into
             volume, and the angle of repose; what it predicts is for the soil of its training.
         machine: What digs. A learned world takes from it the width of the bucket.
@@ -224,22 +50,29 @@ def load_world(
     """
     check_soil(soil)
     check_machine(machine)
-    if name == "simulator":
-        return Simulator(machine=machine, soil=soil)
-    if name == "dem":
-        return DiscreteElements(machine=machine, soil=soil)
-    if name in MODELS:
-        psi, *others = MODELS[name]
-        predictor: Any = load_model(pretrained_path(psi) if model is None else model, psi)
-        if name == "low":
-            return LowWorld(predictor, machine=machine, soil=soil)
-        if name == "hybrid":
-            return HybridWorld(predictor, machine=machine, soil=soil)
-        place = pretrained_path(others[0]) if pile_state is None else Path(pile_state)
-        phi: Any = load_model(place, read_description(place, kind=None)["kind"])
-        if not isinstance(phi, HeightChangeModel | PileStateModel):
-            raise InputError(f"{place}: is not a pile state model: name one of `train phi`.")
-        return HighWorld(predictor, phi, machine=machine, soil=soil)
-    raise InputError(
-        f"unknown world {name!r}; choose one of {', '.join(dict.fromkeys((*WORLDS, *ENGINES)))}"
-    )
+    if not isinstance(name, str) or name not in WORLDS:
+        raise InputError(f"unknown world {name!r}: choose one of {', '.join(WORLDS)}.")
+    recipe = WORLDS[name]
+    if isinstance(recipe, str):
+        if model is not None or pile_state is not None:
+            raise InputError(f"the world {name!r} has no models: leave them out.")
+        engine: World = load_object(recipe)(machine=machine, soil=soil)
+        return engine
+    psi = _model(recipe.performance if model is None else Path(model), _PERFORMANCE)
+    place = recipe.pile_state if pile_state is None else Path(pile_state)
+    phi: Any = Strip() if place is None else _model(place, _PILE_STATE)
+    return LearnedWorld(psi, phi, machine=machine, soil=soil)
+
+
+# Kinds of models in either place of a learned world, and what makes them.
+_PERFORMANCE, _PILE_STATE = ("psi_low", "psi_high"), ("phi", "phi_vae")
+
+
+def _model(place: str | Path, kinds: tuple[str, ...]) -> Any:
+    """A model that ships, by its name, or one in a directory."""
+    folder = pretrained_path(place) if isinstance(place, str) else place
+    kind = read_description(folder, kind=None)["kind"]
+    if kind not in kinds:
+        makers = " or ".join(f"`wlplan train {k.replace('_', '-')}`" for k in kinds)
+        raise InputError(f"{folder}: is a {kind}: name a model that {makers} made.")
+    return load_model(folder, kind)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 
-from wlplan.constants import CELL_SIZE
+from wlplan.constants import CELL_SIZE, J_PER_KJ
 from wlplan.engines.dem import columns
 from wlplan.engines.dem.bucket import PLATE_RADIUS, plate_spheres, section_of
 from wlplan.engines.dem.engine import Engine, open_box
@@ -52,6 +53,16 @@ class Played:
     envelope_before: np.ndarray  # upper surface likewise
     envelope_after: np.ndarray
     record: np.ndarray  # rows of `loader.RECORDED`
+
+    def as_dict(self) -> dict[str, Any]:
+        """What plan.json says of a cycle: SI units, but for the work of the wheels' slip [kJ]."""
+        return {
+            "stop_reason": self.stop_reason,
+            "slip_work": self.work_slip / J_PER_KJ,
+            "spheres": self.spheres,
+            "cleared_volume": self.cleared,
+            "lost_volume": self.lost,
+        }
 
 
 def play_cycle(

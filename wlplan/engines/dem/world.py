@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, no_type_check
 
 import jax
@@ -24,7 +24,7 @@ from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, Soil
 from wlplan.terrain.automaton import DEFAULT_SCHEDULE, Schedule, settle_dug, window_of
 from wlplan.terrain.heightmap import add_local_change, local_points, sample
-from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose, action_vector
+from wlplan.types import Action, Performance, Pile, Pose, action_vector
 
 # Where a pile higher than the bed matters: as far ahead as a loading moves soil [m], and how much
 # of it has to be missing, as a mean over the bucket's width [m].
@@ -45,6 +45,8 @@ class DiscreteElements(struct.PyTreeNode):
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     settings: Settings = struct.field(pytree_node=False, default=Settings())
     schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
+
+    differentiable = False
 
     def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         """The pile and the performance after one loading.
@@ -95,6 +97,48 @@ class DiscreteElements(struct.PyTreeNode):
             )
         return played
 
+    def play_load(
+        self, pile: Pile, pose: Pose, action: Action, note: Callable[[str], None]
+    ) -> tuple[Pile, Performance, Played]:
+        """Plays one loading outside of any trace.
+
+        What was played is in the cache: to go on after an interrupt, begin again.
+
+        Args:
+            pile: Pile before.
+            pose: Dig location and heading.
+            action: Parameters of the bucket-filling controller.
+            note: As of `play`.
+
+        Returns:
+            The pile after, the performance, and the record of the cycle.
+
+        Raises:
+            InputError: As of `play`.
+        """
+        surface, numbers = self.view(pile, pose), action_vector(action)
+        played = self.play(np.asarray(surface), np.asarray(numbers), note)
+        change, outcome = (
+            jnp.asarray(part, pile.height.dtype) for part in outcome_of(played, self)
+        )
+        return *self.leave(pile, pose, change, outcome), played
+
+    def notes(self) -> list[str]:
+        """What to know before a plan is played."""
+        ignored = [
+            name
+            for name in ("friction", "cohesion", "adhesion")
+            if getattr(self.soil, name) != getattr(GRAVEL, name)
+        ]
+        notes = [
+            f"the spheres are gravel: of the soil only density and friction on steel carry over, "
+            f"{' and '.join(ignored)} not"
+        ]
+        return (notes if ignored else []) + [
+            f"a load takes a minute or more; those that were played are kept in "
+            f"{process.cache_folder()}, so that the same command goes on where it was interrupted"
+        ]
+
     def leave(
         self,
         pile: Pile,
@@ -128,8 +172,8 @@ def _leave(
     pile: Pile, pose: Pose, change: Float[Array, "n n"], repose_angle: float, schedule: Schedule
 ) -> Pile:
     window, start = window_of(pile, pose)
-    dug = add_local_change(window.height, window, pose, change, columns.DISPLACEMENT)
-    return settle_dug(pile, dug, start, repose_angle=repose_angle, schedule=schedule)
+    dug, _ = add_local_change(window.height, window, pose, change, columns.DISPLACEMENT)
+    return settle_dug(pile, dug, start, repose_angle=repose_angle, schedule=schedule).pile
 
 
 def outcome_of(played: Played, world: DiscreteElements) -> tuple[np.ndarray, np.ndarray]:
@@ -137,51 +181,6 @@ def outcome_of(played: Played, world: DiscreteElements) -> tuple[np.ndarray, np.
     work = played.work_drive + played.work_boom + played.work_bucket + played.work_slip
     numbers = [played.mass / KG_PER_TONNE, played.time, work / J_PER_KJ]
     return change_of(played, world.soil.density), np.array(numbers)
-
-
-def loads(
-    world: DiscreteElements, pile: Pile, plan: LoadingPlan, tell: Callable[[str], None]
-) -> Iterator[tuple[Pile, Performance, Played]]:
-    """Plays a plan load by load, outside of any trace.
-
-    What was played is in the cache: to go on after an interrupt, begin again.
-
-    Args:
-        world: The engine.
-        pile: The pile before the first loading.
-        plan: N loadings in order.
-        tell: As of `DiscreteElements.play`.
-
-    Yields:
-        After each loading: the pile, the performance, and the record of the cycle.
-
-    Raises:
-        InputError: As of `DiscreteElements.play`.
-    """
-    for n in range(len(plan.pose.x)):
-        pose, action = jax.tree.map(lambda leaf, n=n: leaf[n], (plan.pose, plan.action))
-        surface, numbers = world.view(pile, pose), action_vector(action)
-        played = world.play(np.asarray(surface), np.asarray(numbers), tell)
-        change, outcome = (
-            jnp.asarray(part, pile.height.dtype) for part in outcome_of(played, world)
-        )
-        pile, performance = world.leave(pile, pose, change, outcome)
-        yield pile, performance, played
-
-
-def site_remark(soil: Soil) -> str | None:
-    """What of a soil has no effect on the spheres, in one line; None if all has."""
-    ignored = [
-        name
-        for name in ("friction", "cohesion", "adhesion")
-        if getattr(soil, name) != getattr(GRAVEL, name)
-    ]
-    if not ignored:
-        return None
-    return (
-        f"the spheres are gravel: of the soil only density and friction on steel carry over, "
-        f"{' and '.join(ignored)} not"
-    )
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

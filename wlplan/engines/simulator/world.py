@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import no_type_check
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
@@ -20,7 +22,7 @@ from wlplan.terrain.heightmap import (
     local_points,
     sample,
 )
-from wlplan.types import Action, Performance, Pile, Pose
+from wlplan.types import Action, Performance, Pile, Pose, SolveReport
 
 
 @no_type_check
@@ -33,15 +35,31 @@ class Simulator(struct.PyTreeNode):
     schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
 
     def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
-        """The pile and the performance after one loading."""
-        after, performance, _ = self.play(pile, pose, action)
+        """The pile and the performance after one loading.
+
+        The loader stands on the floor at the dig location, level; a floor that rises into the
+        pile limits the cut from below. The pile is relaxed; the work includes the wheels' slip.
+        """
+        after, performance, _ = _solve(self, pile, pose, action)
         return after, performance
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether it passes reverse mode, which takes several times as long."""
+        return self.settings.differentiable
+
+    def with_derivatives(self) -> Simulator:
+        """The same simulator, in the setting that passes reverse mode."""
+        return self.replace(settings=dataclasses.replace(self.settings, differentiable=True))
+
+    def solve(
+        self, pile: Pile, pose: Pose, action: Action
+    ) -> tuple[Pile, Performance, SolveReport]:
+        """One loading as by calling it, and how the automaton ended."""
+        return _solve(self, pile, pose, action)
 
     def play(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance, Cycle]:
         """One loading with its record.
-
-        The loader stands on the floor at the dig location, level; a floor that rises into the
-        pile limits the cut from below.
 
         Args:
             pile: Pile before.
@@ -49,8 +67,7 @@ class Simulator(struct.PyTreeNode):
             action: Parameters of the bucket-filling controller.
 
         Returns:
-            The pile after, relaxed; the performance, whose work includes the wheels' slip; and
-            the record of the cycle in SI units.
+            The pile after, relaxed; the performance; and the record of the cycle in SI units.
         """
         height, ground = self.view(pile, pose)
         cycle = dig(
@@ -61,7 +78,8 @@ class Simulator(struct.PyTreeNode):
             soil=self.soil,
             settings=self.settings,
         )
-        return *self.leave(pile, pose, height, cycle), cycle
+        after, performance, _ = self.leave(pile, pose, height, cycle)
+        return after, performance, cycle
 
     def view(self, pile: Pile, pose: Pose) -> tuple[Float[Array, "52 52"], Float[Array, "52 52"]]:
         """Surface and floor in the local frame of a dig pose, over the floor there [m]."""
@@ -76,7 +94,7 @@ class Simulator(struct.PyTreeNode):
 
     def leave(
         self, pile: Pile, pose: Pose, height: Float[Array, "52 52"], cycle: Cycle
-    ) -> tuple[Pile, Performance]:
+    ) -> tuple[Pile, Performance, SolveReport]:
         """Writes a loading back to its pile.
 
         Args:
@@ -86,13 +104,13 @@ class Simulator(struct.PyTreeNode):
             cycle: Record of the loading.
 
         Returns:
-            The pile after, relaxed, and the performance, as `play` does.
+            The pile after, relaxed, the performance, and how the automaton ended.
         """
         window, start = window_of(pile, pose)
         # What left the grid is the load: float rounding of the time stepping goes to the mass.
         change = cycle.height - height
-        dug = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
-        after = settle_dug(
+        dug, missing = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+        settled = settle_dug(
             pile,
             dug,
             start,
@@ -103,4 +121,21 @@ class Simulator(struct.PyTreeNode):
         performance = Performance(
             mass=cycle.mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ
         )
-        return after, performance
+        report = SolveReport(settled.rounds, settled.at_rest, settled.steepest_slope, missing)
+        return settled.pile, performance, report
+
+
+@jax.jit
+def _solve(
+    simulator: Simulator, pile: Pile, pose: Pose, action: Action
+) -> tuple[Pile, Performance, SolveReport]:
+    height, ground = simulator.view(pile, pose)
+    cycle = dig(
+        height,
+        ground,
+        action,
+        machine=simulator.machine,
+        soil=simulator.soil,
+        settings=simulator.settings,
+    )
+    return simulator.leave(pile, pose, height, cycle)

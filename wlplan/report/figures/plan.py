@@ -7,7 +7,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from wlplan.planning.transport import Receiver
 from wlplan.report.figures.digs import LABEL_PART, draw_digs, label_places
 from wlplan.report.figures.relief import (
     PILE,
@@ -20,6 +19,7 @@ from wlplan.report.figures.relief import (
 )
 from wlplan.report.figures.style import BLUE, frame_map, map_panels
 from wlplan.report.figures.truck import Truck, draw_truck
+from wlplan.site.receiver import Receiver
 from wlplan.types import LoadingPlan, Pile
 
 

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
-from wlplan.planning.transport import Receiver
 from wlplan.report.figures.style import INK, PALE, add_arrow
+from wlplan.site.receiver import Receiver
 
 # How far a truck may stand outside the view of the pile to widen it, as a part of the longer side;
 # one further away becomes an arrow at the border.

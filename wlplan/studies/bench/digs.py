@@ -85,5 +85,5 @@ def _dig(
 ) -> tuple[Pile, Pile, tuple[Array, Array], Pile]:
     """The window before and dug, its first cell, and the pile once it has slid."""
     before, start = window_of(pile, pose)
-    dug, _ = excavate(before, pose, volume, width=WA320.bucket_width)
-    return before, dug, start, settle_dug(pile, dug.height, start)
+    dug = excavate(before, pose, volume, width=WA320.bucket_width).pile
+    return before, dug, start, settle_dug(pile, dug.height, start).pile

@@ -113,7 +113,7 @@ class Setup:
     @functools.cached_property
     def settle(self) -> tuple[Callable[..., Any], float]:
         """`automaton.settle` of a window, compiled, and the time that took [s]."""
-        return compiled(settle, self.digs[0].dug)
+        return compiled(lambda window: settle(window).pile, self.digs[0].dug)
 
     @functools.cached_property
     def settle_dug(self) -> tuple[Callable[..., Any], float]:
@@ -164,4 +164,4 @@ def loaded(dig: Dig) -> tuple[Pile, Array, tuple[Array, Array]]:
 
 def after_a_load(pile: Pile, dug: Array, start: tuple[Array, Array]) -> Array:
     """The surface of the whole grid once it has slid [m]."""
-    return settle_dug(pile, dug, start).height
+    return settle_dug(pile, dug, start).pile.height

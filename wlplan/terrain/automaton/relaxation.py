@@ -5,20 +5,31 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from wlplan.checks import check_pile, is_traced
 from wlplan.site.soil import GRAVEL
 from wlplan.terrain.automaton.rounds import DEFAULT_SCHEDULE, Schedule, Terrain, one_round
-from wlplan.terrain.automaton.slopes import movable, rises, steeper_than
+from wlplan.terrain.automaton.slopes import movable, rises, steeper_than, steepest_slope
 from wlplan.terrain.automaton.windows import pad_pile, paste
 from wlplan.terrain.heightmap import cut_out
 from wlplan.types import Pile
+
+
+class Settled(NamedTuple):
+    """A pile that was let slide, and how that ended."""
+
+    pile: Pile
+    rounds: Int[Array, ""]  # that were made
+    at_rest: Bool[Array, ""]  # False: it gave up after the schedule's `most_rounds`
+    steepest_slope: Float[Array, ""]  # left between cells that can slide [rad]
 
 
 def settle(
@@ -26,7 +37,7 @@ def settle(
     *,
     repose_angle: float = GRAVEL.repose_angle,
     schedule: Schedule = DEFAULT_SCHEDULE,
-) -> Pile:
+) -> Settled:
     """Relaxes a disturbed pile until it is within the schedule's tolerance.
 
     Slopes of the floor itself, where no soil lies on it, are not changed, nor are unseen cells.
@@ -37,10 +48,10 @@ def settle(
         schedule: Sweeps, tolerance, and when to give up.
 
     Returns:
-        A pile of the same volume; the same pile if it was within the tolerance. Differentiable in
-        `pile.height` by reverse mode, whose memory is one surface a round and what a single round
-        leaves. Under `vmap` every member makes its own number of rounds on the CPU, one after the
-        other; on other devices all make as many as the slowest.
+        A pile of the same volume; the same pile if it was within the tolerance; and how it ended.
+        The pile is differentiable in `pile.height` by reverse mode, whose memory is one surface a
+        round and what a single round leaves. Under `vmap` every member makes its own number of
+        rounds on the CPU, one after the other; on other devices all make as many as the slowest.
     """
     return _settled(pile, pile.height, jnp.zeros(2, jnp.int32), repose_angle, schedule)
 
@@ -52,7 +63,7 @@ def settle_dug(
     *,
     repose_angle: float = GRAVEL.repose_angle,
     schedule: Schedule = DEFAULT_SCHEDULE,
-) -> Pile:
+) -> Settled:
     """Writes a window that was dug in back into its pile and lets the pile slide.
 
     The window is settled alone, its sides being walls. Where that leaves the pile too steep
@@ -67,9 +78,21 @@ def settle_dug(
         schedule: Sweeps, tolerance, and when to give up.
 
     Returns:
-        The pile afterwards, see `settle`.
+        The pile afterwards and how it ended, see `settle`.
     """
     return _settled(pile, dug, jnp.stack(start), repose_angle, schedule)
+
+
+@overload
+def relax(
+    pile: Pile, *, repose_angle: float = ..., tolerance: float = ..., report: Literal[False] = ...
+) -> Pile: ...
+
+
+@overload
+def relax(
+    pile: Pile, *, repose_angle: float = ..., tolerance: float = ..., report: Literal[True]
+) -> Settled: ...
 
 
 def relax(
@@ -77,17 +100,43 @@ def relax(
     *,
     repose_angle: float = GRAVEL.repose_angle,
     tolerance: float = math.radians(1.0),
-) -> Pile:
+    report: bool = False,
+) -> Pile | Settled:
     """Lets a pile slide until no slope exceeds the angle of repose; keeps its volume.
 
     Args:
         pile: Any pile.
         repose_angle: Angle of repose [rad].
         tolerance: How much steeper than `repose_angle` the result may be [rad].
+        report: Whether to return how it ended, too.
 
     Returns:
-        The relaxed pile, see `settle`, which this is with more patience.
+        The relaxed pile, or with `report` what `settle` returns, which this is with more patience.
+
+    Raises:
+        InputError: If a height is NaN or infinite.
+
+    Warns:
+        RuntimeWarning: If the pile is not at rest when it gives up. Not under `jit`, where only
+            the report says so.
     """
+    check_pile(pile)
+    settled = _relaxed(pile, repose_angle, tolerance)
+    if report:
+        return settled
+    if not is_traced(settled) and not settled.at_rest.all():
+        steepest = math.degrees(float(settled.steepest_slope.max()))
+        warnings.warn(
+            f"the pile is not at rest: after {int(settled.rounds.max())} rounds a slope of "
+            f"{steepest:.0f} degrees is left",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return settled.pile
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _relaxed(pile: Pile, repose_angle: float, tolerance: float) -> Settled:
     schedule = dataclasses.replace(DEFAULT_SCHEDULE, tolerance=tolerance, most_rounds=_MOST_ROUNDS)
     return settle(pile, repose_angle=repose_angle, schedule=schedule)
 
@@ -96,17 +145,25 @@ def relax(
 _MOST_ROUNDS = 200
 
 
-def _settled(pile: Pile, dug: Array, start: Array, repose_angle: float, schedule: Schedule) -> Pile:
+def _settled(
+    pile: Pile, dug: Array, start: Array, repose_angle: float, schedule: Schedule
+) -> Settled:
     one_by_one = jax.default_backend() == "cpu"
     solve = _solver(pile.cell_size, repose_angle, schedule, one_by_one)
-    return pile.replace(height=solve(pile.height, dug, pile.ground, pile.valid, start))
+    height, rounds, at_rest = solve(pile.height, dug, pile.ground, pile.valid, start)
+    after = pile.replace(height=height)
+    still = lax.stop_gradient(after)
+    slope = steepest_slope(still, movable(still, repose_angle))
+    return Settled(after, rounds, at_rest, slope)
 
 
 @functools.cache
 def _solver(
     cell_size: float, repose_angle: float, schedule: Schedule, one_by_one: bool
-) -> Callable[[Array, Array, Array | None, Array | None, Array], Array]:
+) -> Callable[[Array, Array, Array | None, Array | None, Array], tuple[Array, Array, Array]]:
     """Relaxation of (before, dug, ground, valid, start), with its reverse rule, for one setting.
+
+    It returns the surface, the rounds that were made, and whether it is at rest.
 
     `dug` is a window that begins at `start`, or all of the grid. The rule keeps the surface before
     and nothing else, and makes the rounds again: so where a rollout is rematerialised, XLA drops
@@ -159,9 +216,10 @@ def _solver(
 
     def run(
         before: Array, dug: Array, ground: Array | None, valid: Array | None, start: Array
-    ) -> Array:
+    ) -> tuple[Array, Array, Array]:
         pile = Pile(before, cell_size, (0.0, 0.0), ground, valid)
-        return make_rounds(pile, dug, start, room=0).height
+        last = make_rounds(pile, dug, start, room=0)
+        return last.height, last.made, ~last.steep
 
     def pull(
         before: Array,
@@ -195,14 +253,15 @@ def _solver(
     @jax.custom_vjp
     def solve(
         before: Array, dug: Array, ground: Array | None, valid: Array | None, start: Array
-    ) -> Array:
+    ) -> tuple[Array, Array, Array]:
         return run(before, dug, ground, valid, start)
 
     def forward(*arguments: Any):
         return run(*arguments), arguments
 
-    def backward(arguments: tuple[Any, ...], cotangent: Array):
-        return *pull(*(*arguments, cotangent)), None, None, None
+    def backward(arguments: tuple[Any, ...], cotangents: tuple[Array, Any, Any]):
+        # Rounds, and whether it is at rest, have no derivative.
+        return *pull(*(*arguments, cotangents[0])), None, None, None
 
     solve.defvjp(forward, backward)
     return solve

@@ -29,9 +29,15 @@ def steeper_than(limit: float, height: Array, active: Array | None) -> Bool[Arra
     return jnp.where(steep, 1.0, 0.0).sum() > 0.0
 
 
-def steepest_slope(pile: Pile) -> Float[Array, ""]:
-    """Steepest slope between any two neighbouring cells that were seen [rad]."""
-    steepest = functools.reduce(jnp.maximum, rises(pile.height, pile.valid)).max()
+def steepest_slope(pile: Pile, active: Bool[Array, "nx ny"] | None = None) -> Float[Array, ""]:
+    """Steepest slope between any two neighbouring cells of a pile [rad].
+
+    Args:
+        pile: One pile.
+        active: Cells that count; by default all that were seen.
+    """
+    which = pile.valid if active is None else active
+    steepest = functools.reduce(jnp.maximum, rises(pile.height, which)).max()
     return jnp.arctan(steepest / pile.cell_size)
 
 

@@ -10,9 +10,11 @@ from laws import assert_gradient
 
 import wlplan
 from wlplan.engines.simulator import Simulator
-from wlplan.planning.objective import OBJECTIVES, loading_cost
+from wlplan.planning.job import Job, play_candidate
+from wlplan.planning.objective import objective_of
 from wlplan.planning.rollout import closed_loop, rollout
-from wlplan.planning.transport import Receiver, transport
+from wlplan.site.receiver import Receiver
+from wlplan.site.site import Site
 from wlplan.site.soil import GRAVEL
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
@@ -127,15 +129,19 @@ def test_closed_loop_decides_on_the_pile_as_it_is():
         return after, Performance(mass=pose.x, time=pose.y, work=pose.heading)
 
     thresholds = jnp.asarray([0.5, 0.2, 0.1])
-    outcome, plan = closed_loop(world, heap(), thresholds, decide)
+
+    def record(_, pose, action, performance):
+        return LoadingPlan(pose, action), performance
+
+    after, (plan, performance) = closed_loop(world, heap(), thresholds, decide, record)
     left = np.cumprod([1.0, 0.5, 0.8])
     np.testing.assert_allclose(plan.pose.x, float(volume(heap())) * left, rtol=1e-5)
     np.testing.assert_allclose(plan.pose.y, float(heap().height.max()) * left, rtol=1e-5)
     np.testing.assert_allclose(plan.action.delta_bk, thresholds)
-    np.testing.assert_allclose(outcome.performance.mass, plan.pose.x)
+    np.testing.assert_allclose(performance.mass, plan.pose.x)
     # Played again as a fixed plan, it is the same.
     again = rollout(world, heap(), plan)
-    np.testing.assert_allclose(again.pile.height, outcome.pile.height)
+    np.testing.assert_allclose(again.pile.height, after.height)
 
 
 # --- The worlds that ship. ----------------------------------------------------------------------
@@ -209,15 +215,8 @@ def test_the_simulator_rolls_out_under_the_same_signature(cone, roll):
 def cost_in(world, pile):
     """The objective of a plan, transport included."""
     receiver = Receiver(*(jnp.asarray(v, pile.height.dtype) for v in (-18.0, -3.0, -0.5)))
-
-    def cost(plan):
-        performance = rollout(world, pile, plan).performance
-        time, work = jax.vmap(lambda pose, mass: transport(pose, receiver, mass))(
-            plan.pose, performance.mass
-        )
-        return loading_cost(OBJECTIVES["efficiency"], performance, time, work).sum()
-
-    return cost
+    job = Job(world, pile, Site(receiver=receiver), objective_of("efficiency"))
+    return lambda plan: play_candidate(job, plan, report=False).cost
 
 
 def test_gradient_of_five_loadings_against_finite_differences(low, cone):

@@ -1,61 +1,27 @@
-"""A plan that was played: its sums, its ledger, its table."""
+"""The table of a plan, and remarks on its ledger."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from wlplan.cli.outputs import print_table, remark, titled_table
 from wlplan.constants import QUANTITIES
 from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error
 
-if TYPE_CHECKING:
-    from wlplan.planning.plan import PlanResult
-    from wlplan.types import Performance, Pile
 
-
-def _sum(values: Any) -> float:
-    import numpy as np
-
-    return float(np.asarray(values, np.float64).sum())
-
-
-def totals(performance: Performance, cost: Any = None) -> dict[str, float]:
-    """Sums of mass [tonne], time [s] and work [kJ] over the loads, and the cost if there is one."""
-    sums = {quantity: _sum(getattr(performance, quantity)) for quantity in QUANTITIES}
-    return sums if cost is None else {**sums, "cost": float(cost)}
-
-
-def transport_totals(result: PlanResult) -> dict[str, float]:
-    """Time [s] and work [kJ] of the ways of all loads."""
-    return {"time": _sum(result.transport_time), "work": _sum(result.transport_work)}
-
-
-def ledger_of(pile: Pile, simulated: PlanResult, simulator: Any) -> dict[str, float]:
-    """What left the pile [m^3], and what was loaded [tonne], at a density [tonne/m^3]."""
-    import numpy as np
-
-    from wlplan.constants import KG_PER_TONNE
-
-    def volume(after: Pile) -> float:
-        # In float64: a bucket is a small difference of large volumes.
-        above = np.asarray(after.height, np.float64) - np.asarray(after.floor, np.float64)
-        return float(above.sum()) * after.cell_size**2
-
-    return {
-        "volume_before": volume(pile),
-        "volume_after": volume(simulated.rollout.pile),
-        "mass_removed": _sum(simulated.rollout.performance.mass),
-        "density": simulator.soil.density / KG_PER_TONNE,
-    }
-
-
-def remark_on_ledger(ledger: Mapping[str, float]) -> None:
-    """Tell if volume and mass of a ledger do not agree."""
+def remark_on_ledger(ledger: Mapping[str, Any]) -> None:
+    """Remarks if volume and mass of a ledger do not agree, or a solver did not end well."""
     error = ledger_error(ledger)
     if error > LEDGER_TOLERANCE:
         remark(f"the ledger of the simulated pile is off by {100.0 * error:.2g} %")
+    unsettled = ledger.get("solves", {}).get("unsettled_loads")
+    if unsettled:
+        remark(
+            f"the avalanche after load {', '.join(map(str, unsettled))} did not come to rest: the "
+            f"pile is left steeper than the soil stands"
+        )
 
 
 def print_plan(document: Mapping[str, Any]) -> None:
@@ -103,3 +69,9 @@ def print_plan(document: Mapping[str, Any]) -> None:
         f"ledger: {ledger['volume_before']:.2f} m³ before, {ledger['volume_after']:.2f} m³ after; "
         f"{lost:.3f} m³ at {ledger['density']:.3f} t/m³ for {ledger['mass_removed']:.3f} t loaded"
     )
+    solves = ledger.get("solves")
+    if solves:
+        print(
+            f"avalanches: at most {solves['most_rounds']} rounds, steepest slope left "
+            f"{solves['steepest_slope_deg']:.1f}°"
+        )

@@ -1,0 +1,31 @@
+"""One loading as objectives see it."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+from flax import struct
+from jaxtyping import Array, Float
+
+from wlplan.site.site import Site
+from wlplan.types import Action, Performance, Pile, Pose
+
+
+@no_type_check
+class Transport(struct.PyTreeNode):
+    """From the end of a loading to the receiver and back to the start of the next approach."""
+
+    time: Float[Array, "*n"]  # dumping included [s]
+    work: Float[Array, "*n"]  # [kJ]
+
+
+@no_type_check
+class Loading(struct.PyTreeNode):
+    """One loading with all that a term of an objective may look at; scalar leaves."""
+
+    pile: Pile  # before
+    pose: Pose
+    action: Action
+    performance: Performance
+    transport: Transport
+    site: Site

@@ -1,0 +1,151 @@
+"""The cheapest next loading, again and again: meant to be hard to beat."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from wlplan.actions import spread_actions
+from wlplan.planning.descent import descend
+from wlplan.planning.job import (
+    Decisions,
+    Job,
+    check_has_gradient,
+    contour_length,
+    cost_of_next,
+    decide,
+    stacked,
+)
+from wlplan.planning.proposals import Progress, Proposals
+from wlplan.types import Pile
+from wlplan.worlds.capabilities import is_differentiable
+from wlplan.xla import ParallelMap
+
+
+@dataclasses.dataclass(frozen=True)
+class Greedy:
+    """Tries many poses and actions for the next loading and refines the best by gradient.
+
+    In a world without a derivative nothing is refined.
+    """
+
+    # Poses a metre of contour, heading offsets before squashing, and actions that are tried.
+    poses_per_metre: float = 1.5
+    offsets: tuple[float, ...] = (-0.6, 0.0, 0.6)
+    actions: int = 24
+    # Candidates that are refined, each at a pose of its own, and steps and rate of Adam.
+    refined: int = 8
+    refine_steps: int = 30
+    refine_rate: float = 0.08
+    # Candidates that are evaluated at once: bounds the memory.
+    batch: int = 256
+
+    @classmethod
+    def by_trial(cls) -> Greedy:
+        """The default in worlds without a derivative, where a trial takes long: fewer of them."""
+        return cls(poses_per_metre=1.0, actions=16, refine_steps=0)
+
+    def propose(
+        self, job: Job, loads: int, *, seed: int, progress: Progress | None = None
+    ) -> Proposals:
+        """One plan, leaves [1, N]; arguments as of `Planner.propose`."""
+        refines = self.refine_steps > 0 and is_differentiable(job.world) is not False
+        if refines:
+            check_has_gradient(job, "say so by wlplan.world(function, differentiable=False)")
+        random = np.random.default_rng(seed)
+        dtype = job.pile.height.dtype
+        count = max(8, round(self.poses_per_metre * float(contour_length(job))))
+        pile, chosen = job.pile, []
+        for load in range(loads):
+            # A fresh shift a loading, so that poses are not tied to one raster.
+            positions = (np.arange(count) + random.random()) / count
+            poses = np.stack(np.meshgrid(positions, self.offsets, indexing="ij"), -1)
+            poses = poses.reshape(-1, 2).astype(dtype)
+            actions = spread_actions(self.actions, random, dtype)
+            costs = _candidate_costs(job, pile, poses, actions, batch=self.batch)
+            # One start a pose, so that refinement does not begin in the same place eight times.
+            best_poses = np.argsort(costs.min(axis=1))[: self.refined]
+            starts = Decisions(
+                position=jnp.asarray(poses[best_poses, 0]),
+                offset=jnp.asarray(poses[best_poses, 1]),
+                action=actions[costs.argmin(axis=1)[best_poses]],
+            )
+            values = costs.min(axis=1)[best_poses]
+            if refines:
+                starts, refined = _refine(
+                    job, pile, starts, steps=self.refine_steps, rate=self.refine_rate
+                )
+                values = np.asarray(refined)
+            best = int(np.nanargmin(values))
+            decision = jax.tree.map(lambda leaf, b=best: leaf[b], starts)
+            pile = _advance(job, pile, decision)
+            chosen.append(decision)
+            if progress is not None:
+                progress("greedy", load + 1, loads, float(values[best]))
+        return Proposals(jax.tree.map(lambda leaf: leaf[None], stacked(chosen)))
+
+
+def _costs_at_poses(
+    shared: tuple[Job, Pile, Float[Array, "a 4"]], poses: Float[Array, "p 2"]
+) -> Float[Array, "p a"]:
+    """Cost of every action at every pose; what depends on the pose alone is computed once."""
+    job, pile, actions = shared
+
+    def at_pose(pose: Array) -> Array:
+        return jax.vmap(lambda a: cost_of_next(job, pile, Decisions(pose[0], pose[1], a)))(actions)
+
+    return jax.vmap(at_pose)(poses)
+
+
+_costs_of_portions = ParallelMap(_costs_at_poses)
+
+
+def _candidate_costs(
+    job: Job,
+    pile: Pile,
+    poses: Float[np.ndarray, "p 2"],
+    actions: Float[Array, "a 4"],
+    *,
+    batch: int,
+) -> Float[np.ndarray, "p a"]:
+    """Cost of every action at every pose, in portions of at most `batch` of one shape.
+
+    Poses are positions along the toe and heading offsets, as in `Decisions`. Their number follows
+    from the length of the toe; if that were a shape, every next pile would be compiled for.
+    """
+    size = max(1, batch // len(actions))
+    portions = -(-len(poses) // size)
+    rows = np.minimum(np.arange(portions * size), len(poses) - 1).reshape(portions, size)
+    costs = _costs_of_portions((job, pile, actions), poses[rows])
+    return np.asarray(costs).reshape(-1, len(actions))[: len(poses)]
+
+
+@functools.partial(jax.jit, static_argnames=("steps", "rate"))
+def _refine(
+    job: Job, pile: Pile, starts: Decisions, *, steps: int, rate: float
+) -> tuple[Decisions, Float[Array, " k"]]:
+    """Adam on single loadings, from several starts; returns the best visited of each."""
+    length = contour_length(job)
+
+    def cost(variables: Decisions) -> Array:
+        # Metres along the contour, so that one rate suits all variables.
+        return cost_of_next(job, pile, variables.replace(position=variables.position / length))
+
+    best, costs = descend(
+        jax.vmap(jax.value_and_grad(cost)),
+        starts.replace(position=starts.position * length),
+        optax.adam(optax.cosine_decay_schedule(rate, steps)),
+        steps,
+    )
+    return best.replace(position=best.position / length), costs
+
+
+@jax.jit
+def _advance(job: Job, pile: Pile, decisions: Decisions) -> Pile:
+    return job.world(pile, *decide(job, pile, decisions))[0]

@@ -1,0 +1,113 @@
+"""One fixed action at evenly spread poses, the action tuned on the very pile it is used on."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from wlplan.actions import spread_actions
+from wlplan.planning.descent import Descent, begin, descend_stepwise, step
+from wlplan.planning.job import (
+    Decisions,
+    Job,
+    check_has_gradient,
+    costs_and_gradients,
+    outcomes,
+)
+from wlplan.planning.proposals import Progress, Proposals
+from wlplan.worlds.capabilities import is_differentiable
+
+
+@dataclasses.dataclass(frozen=True)
+class Nominal:
+    """The best actions of a Latin hypercube, each judged by its whole plan, refined by Adam.
+
+    In a world without a derivative nothing is refined.
+    """
+
+    # Actions that are tried, and how many plans are played side by side.
+    actions: int = 24
+    rows: int = 6
+    # Steps of Adam on the best `rows` of them, and its rate.
+    refine_steps: int = 30
+    refine_rate: float = 0.16
+
+    @classmethod
+    def by_trial(cls) -> Nominal:
+        """The default in worlds without a derivative, where a trial takes long: fewer of them."""
+        return cls(actions=16, refine_steps=0)
+
+    def propose(
+        self, job: Job, loads: int, *, seed: int, progress: Progress | None = None
+    ) -> Proposals:
+        """One plan, leaves [1, N]; arguments as of `Planner.propose`."""
+        refines = self.refine_steps > 0 and is_differentiable(job.world) is not False
+        if refines:
+            check_has_gradient(job, "say so by wlplan.world(function, differentiable=False)")
+        batches = -(-self.actions // self.rows)
+        random = np.random.default_rng(seed)
+        trials = spread_actions(self.rows * batches, random, job.pile.height.dtype)
+        total = batches + (self.refine_steps if refines else 0)
+
+        def evaluate(actions: Array) -> tuple[Array, Array]:
+            plans = evenly_spread(job, loads, actions)
+            if not refines:
+                return outcomes(job, plans).cost, jnp.zeros_like(actions)
+            costs, gradients = costs_and_gradients(job, plans)
+            # All loadings share the action.
+            return costs, gradients.action.sum(axis=1)
+
+        tried: list[np.ndarray] = []
+        for k in range(batches):
+            costs, _ = evaluate(trials[k * self.rows : (k + 1) * self.rows])
+            tried.append(np.asarray(costs))
+            if progress is not None:
+                progress("nominal", k + 1, total, float(np.nanmin(np.concatenate(tried))))
+        costs_of_trials = np.concatenate(tried)
+        order = np.argsort(costs_of_trials)
+        best, least = trials[order[0]], float(costs_of_trials[order[0]])
+        if refines:
+
+            def visit(number: int, costs: Array, descent: Descent) -> None:
+                if progress is not None:
+                    reached = min(least, float(np.nanmin(costs)), float(descent.best_costs.min()))
+                    progress("nominal", batches + number + 1, total, reached)
+
+            last = descend_stepwise(
+                evaluate,
+                begin(trials[order[: self.rows]], _optimiser(self.refine_rate)),
+                functools.partial(_advance, rate=self.refine_rate),
+                self.refine_steps,
+                visit,
+            )
+            winner = int(np.argmin(last.best_costs))
+            if float(last.best_costs[winner]) < least:
+                best = last.best[winner]
+        return Proposals(evenly_spread(job, loads, best[None, :]))
+
+
+def _optimiser(rate: float) -> optax.GradientTransformation:
+    return optax.adam(rate)
+
+
+@functools.partial(jax.jit, static_argnames="rate")
+def _advance(descent: Descent, costs: Array, gradients: Array, *, rate: float) -> Descent:
+    return step(descent, costs, gradients, _optimiser(rate))
+
+
+def evenly_spread(job: Job, loads: int, actions: Float[Array, "k 4"]) -> Decisions:
+    """Poses at equal distances around the toe, square to it, one action a plan; leaves [K, N]."""
+    dtype = job.pile.height.dtype
+    shape = (actions.shape[0], loads)
+    position = (jnp.arange(loads, dtype=dtype) + 0.5) / loads
+    return Decisions(
+        position=jnp.broadcast_to(position[None, :], shape),
+        offset=jnp.zeros(shape, dtype),
+        action=jnp.broadcast_to(actions[:, None, :], (*shape, 4)),
+    )

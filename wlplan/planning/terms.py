@@ -1,0 +1,60 @@
+"""Terms of an objective: functions of one loading to one number, the smaller the better.
+
+The three of the follow-up are here. References make them comparable: the means of the follow-up's
+greedy plan, 64.4 t, 694 s and 15.5 MJ over 15 loads.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from wlplan.planning.loading import Loading
+
+Term = Callable[[Loading], Float[Array, ""]]
+"""`term(loading)`: a scalar; any function of a loading is one."""
+
+# Load below which M0 / M is held finite [tonne]: a bucket that comes back empty costs as much as
+# about forty good ones.
+_LEAST_MASS = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class InverseMass:
+    """M0 / M: a typical load over this one [1]."""
+
+    reference: float = 4.29  # [tonne]
+
+    def __call__(self, loading: Loading) -> Float[Array, ""]:
+        """The term of a loading."""
+        mass = loading.performance.mass
+        return self.reference / jnp.sqrt(mass**2 + _LEAST_MASS**2)
+
+
+@dataclasses.dataclass(frozen=True)
+class CycleTime:
+    """T / T0: the time of a cycle, transport included, over a typical one [1]."""
+
+    reference: float = 46.3  # [s]
+
+    def __call__(self, loading: Loading) -> Float[Array, ""]:
+        """The term of a loading."""
+        return (loading.performance.time + loading.transport.time) / self.reference
+
+
+@dataclasses.dataclass(frozen=True)
+class CycleWork:
+    """W / W0: the work of a cycle, transport included, over a typical one [1]."""
+
+    reference: float = 1033.0  # [kJ]
+
+    def __call__(self, loading: Loading) -> Float[Array, ""]:
+        """The term of a loading."""
+        return (loading.performance.work + loading.transport.work) / self.reference
+
+
+TERMS: dict[str, Term] = {"mass": InverseMass(), "time": CycleTime(), "work": CycleWork()}
+"""Terms by name."""

@@ -1,0 +1,178 @@
+"""A played plan as the content of plan.json, and the folder that shows it to a person."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wlplan.constants import KG_PER_TONNE, QUANTITIES
+from wlplan.io.plans import plan_to_dict
+from wlplan.planning.job import PlanResult
+from wlplan.site.receiver import Receiver
+from wlplan.site.soil import Soil
+from wlplan.types import Performance, Pile, SolveReport
+
+RECEIVER_FIELDS = tuple(field.name for field in dataclasses.fields(Receiver))
+"""Fields of a receiver in plan.json: x [m], y [m] and heading [rad]."""
+
+
+def receiver_fields(receiver: Receiver) -> dict[str, float]:
+    """What plan.json says about a receiver."""
+    return {name: float(getattr(receiver, name)) for name in RECEIVER_FIELDS}
+
+
+def plan_document(
+    before: Pile,
+    simulated: PlanResult,
+    *,
+    receiver: Receiver,
+    soil: Soil,
+    predicted: Performance | None = None,
+    predicted_cost: float | None = None,
+    **origin: Any,
+) -> dict[str, Any]:
+    """Lays a played plan out as the content of a plan.json, with its sums and its ledger.
+
+    Args:
+        before: The pile before the first loading.
+        simulated: The plan as it was played.
+        receiver: Where its loads go.
+        soil: What was dug; its density closes the ledger.
+        predicted: What the world that planned foresaw, leaves [N]; None: nothing is known of it.
+        predicted_cost: Cost of the plan in that world.
+        **origin: Further top-level fields: pile, soil, machine, world, planner, objective, seed.
+    """
+    total = {
+        "simulated": totals(simulated.rollout.performance, float(simulated.cost)),
+        "transport": {
+            "time": _sum(simulated.transport.time),
+            "work": _sum(simulated.transport.work),
+        },
+    }
+    if predicted is not None:
+        total = {"predicted": totals(predicted, predicted_cost), **total}
+    return plan_to_dict(
+        simulated.plan,
+        predicted=predicted,
+        simulated=simulated.rollout.performance,
+        transport={"time": simulated.transport.time, "work": simulated.transport.work},
+        **origin,
+        receiver=receiver_fields(receiver),
+        total=total,
+        ledger=ledger_of(before, simulated, soil),
+    )
+
+
+def totals(performance: Performance, cost: float | None = None) -> dict[str, float]:
+    """Sums of mass [tonne], time [s] and work [kJ] over the loads, and the cost if there is one."""
+    sums = {quantity: _sum(getattr(performance, quantity)) for quantity in QUANTITIES}
+    return sums if cost is None else {**sums, "cost": cost}
+
+
+def ledger_of(pile: Pile, simulated: PlanResult, soil: Soil) -> dict[str, Any]:
+    """What left the pile [m^3], what was loaded [tonne], and how the solvers ended."""
+
+    def volume(after: Pile) -> float:
+        # In float64: a bucket is a small difference of large volumes.
+        above = np.asarray(after.height, np.float64) - np.asarray(after.floor, np.float64)
+        return float(above.sum()) * after.cell_size**2
+
+    ledger = {
+        "volume_before": volume(pile),
+        "volume_after": volume(simulated.rollout.pile),
+        "mass_removed": _sum(simulated.rollout.performance.mass),
+        "density": soil.density / KG_PER_TONNE,
+    }
+    return ledger if simulated.solves is None else {**ledger, "solves": solved(simulated.solves)}
+
+
+def solved(solves: SolveReport) -> dict[str, Any]:
+    """How the solvers of all loadings ended, the worst of each.
+
+    Args:
+        solves: Leaves [N].
+    """
+    unsettled = np.flatnonzero(~np.asarray(solves.settled)) + 1
+    return {
+        "most_rounds": int(np.asarray(solves.rounds).max()),
+        "steepest_slope_deg": math.degrees(float(np.asarray(solves.steepest_slope).max())),
+        "missing_volume": float(np.abs(np.asarray(solves.missing, np.float64)).max()),
+        "unsettled_loads": unsettled.tolist(),
+    }
+
+
+def violations_of(result: PlanResult, constraints: tuple[str, ...]) -> dict[str, list[int]]:
+    """The loads, counted from 1, that violate each constraint that is violated at all."""
+    found = {
+        name: (np.flatnonzero(np.asarray(result.terms[name]) > 0.0) + 1).tolist()
+        for name in constraints
+    }
+    return {name: loads for name, loads in found.items() if loads}
+
+
+def write_plan_folder(
+    folder: Path,
+    document: Mapping[str, Any],
+    pile: Pile,
+    simulated: PlanResult,
+    *,
+    receiver: Receiver,
+    predicted: Performance | None = None,
+    settings: Mapping[str, str] | None = None,
+) -> list[str]:
+    """Writes plan.json, plan.png, totals.png and report.html into a folder.
+
+    Args:
+        folder: Existing folder.
+        document: Content of the plan.json, see `plan_document`.
+        pile: The pile before the first loading.
+        simulated: The plan as it was played.
+        receiver: Where its loads go.
+        predicted: What the world that planned foresaw, leaves [N], if it is known.
+        settings: Further lines for the page's table of settings, by name.
+
+    Returns:
+        Names of the files, the page first.
+
+    Raises:
+        InputError: If a file cannot be written.
+    """
+    from wlplan.io import write_bytes_atomic, write_plan
+    from wlplan.report import figures
+    from wlplan.report.page import REPORT_NAME, write_report
+
+    count = len(document["loads"])
+    performance = simulated.rollout.performance
+    map_png = figures.png_bytes(
+        figures.plan_figure(
+            pile,
+            simulated.rollout.pile,
+            simulated.plan,
+            receiver=receiver,
+            after_title=f"After {count} load{'s' if count > 1 else ''} in the simulator",
+        )
+    )
+    both = (performance, None) if predicted is None else (predicted, performance)
+    totals_png = figures.png_bytes(figures.totals_figure(*both))
+    write_plan(folder / "plan.json", document)
+    write_bytes_atomic(folder / "plan.png", map_png)
+    write_bytes_atomic(folder / "totals.png", totals_png)
+    write_report(
+        folder,
+        document,
+        figures=(
+            (map_png, "The pile and the digs"),
+            (totals_png, "Predicted beside simulated" if predicted is not None else "Simulated"),
+        ),
+        settings=settings,
+    )
+    return [REPORT_NAME, "plan.json", "plan.png", "totals.png"]
+
+
+def _sum(values: Any) -> float:
+    return float(np.asarray(values, np.float64).sum())

@@ -1,0 +1,40 @@
+"""A site: who digs, what is dug, and what stands around the pile."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+from flax import struct
+
+from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.presets import check_machine, check_soil
+from wlplan.site.receiver import Receiver, default_receiver
+from wlplan.site.soil import GRAVEL, Soil
+from wlplan.types import Pile
+
+
+@no_type_check
+class Site(struct.PyTreeNode):
+    """What a job takes for given, one value from the command line down to transport and toe."""
+
+    machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
+    soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
+    receiver: Receiver | None = None  # None: the default place beside whatever pile there is
+
+    @property
+    def placed_receiver(self) -> Receiver:
+        """The receiver of a site that is beside a pile."""
+        assert self.receiver is not None, "a site has its receiver once it is beside a pile"
+        return self.receiver
+
+    def beside(self, pile: Pile) -> Site:
+        """The site with a receiver: its own, or the default one of a pile.
+
+        Raises:
+            InputError: If soil or machine make no sense.
+        """
+        check_soil(self.soil)
+        check_machine(self.machine)
+        if self.receiver is not None:
+            return self
+        return self.replace(receiver=default_receiver(pile))
