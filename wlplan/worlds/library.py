@@ -15,17 +15,14 @@ from wlplan.engines.dem.world import DiscreteElements
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
 from wlplan.models.ensemble import Ensemble
-from wlplan.models.height_change import HeightChangeModel
 from wlplan.models.performance import PerformanceModel
-from wlplan.models.performance_high import HighPerformanceModel
-from wlplan.models.pile_state import PileStateModel
+from wlplan.models.pile_state import PileStatePredictor
 from wlplan.models.storage import load_model, read_description
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.presets import check_machine, check_soil
 from wlplan.site.soil import GRAVEL, Soil
 from wlplan.terrain.automaton import DEFAULT_SCHEDULE, Schedule, settle_dug, window_of
 from wlplan.terrain.automaton.windows import paste
-from wlplan.terrain.characteristics import as_vector, characteristics
 from wlplan.terrain.excavation import excavate
 from wlplan.terrain.heightmap import (
     STATE_CELLS,
@@ -60,22 +57,19 @@ class LowWorld(struct.PyTreeNode):
 
         Where the strip holds less than the model predicts, the load is what is there.
         """
-        predicted = self.model(self._view(pile, pose), action_vector(action))
+        predicted = self.model(sample_local(pile, pose), action_vector(action))
         return _dug_and_settled(self, pile, pose, predicted)
 
     def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
-        """Standard deviation of what the performance is off, see `_deviation`."""
-        return _deviation(self.model, self._view(pile, pose), action)
-
-    def _view(self, pile: Pile, pose: Pose) -> Float[Array, "4"]:
-        return as_vector(characteristics(sample_local(pile, pose)))
+        """Standard deviation of the error of the performance, see `_deviation`."""
+        return _deviation(self.model, sample_local(pile, pose), action)
 
 
 @no_type_check
 class HybridWorld(struct.PyTreeNode):
     """The hybrid world: ψ_high, mass removal along the strip, automaton. Paper, 4.6."""
 
-    model: HighPerformanceModel | Ensemble
+    model: PerformanceModel | Ensemble
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
@@ -89,7 +83,7 @@ class HybridWorld(struct.PyTreeNode):
         return _dug_and_settled(self, pile, pose, predicted)
 
     def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
-        """Standard deviation of what the performance is off, see `_deviation`."""
+        """Standard deviation of the error of the performance, see `_deviation`."""
         return _deviation(self.model, sample_local(pile, pose), action)
 
 
@@ -106,8 +100,8 @@ class HighWorld(struct.PyTreeNode):
     from the simulator's by 3.0 m³ in place of 6.6, at most 33° steep in place of 83°.
     """
 
-    model: HighPerformanceModel | Ensemble
-    pile_state: HeightChangeModel | PileStateModel
+    model: PerformanceModel | Ensemble
+    pile_state: PileStatePredictor
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
@@ -123,13 +117,8 @@ class HighWorld(struct.PyTreeNode):
         local = sample_local(pile, pose, cells=STATE_CELLS, displacement=STATE_DISPLACEMENT)
         window, start = window_of(pile, pose)
         per_volume = self.soil.density / KG_PER_TONNE
-        exact = isinstance(self.pile_state, HeightChangeModel)
-        if isinstance(self.pile_state, HeightChangeModel):
-            volume = predicted.mass / per_volume
-            ground = local.height - _above_floor(pile, pose)
-            change = self.pile_state(local, vector, volume, ground)
-        else:
-            change = self.pile_state(local, vector) - local.height
+        ground = local.height - _above_floor(pile, pose)
+        change = self.pile_state(local, vector, predicted.mass / per_volume, ground)
         height = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
         if self.settle:
             after = settle_dug(
@@ -141,22 +130,22 @@ class HighWorld(struct.PyTreeNode):
             )
         else:
             after = pile.replace(height=paste(pile.height, height, jnp.stack(start)))
-        if exact:
+        if self.pile_state.conserves_volume:
             left = (window.height - height).sum() * pile.cell_size**2
             predicted = predicted.replace(mass=left * per_volume)
         return after, predicted
 
     def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
-        """Standard deviation of what the performance is off, see `_deviation`."""
+        """Standard deviation of the error of the performance, see `_deviation`."""
         return _deviation(self.model, sample_local(pile, pose), action)
 
 
 def _deviation(
-    model: PerformanceModel | HighPerformanceModel | Ensemble,
-    view: Float[Array, "4"] | LocalHeightmap,
+    model: PerformanceModel | Ensemble,
+    local: LocalHeightmap,
     action: Action,
 ) -> Performance:
-    """Standard deviation of what a predicted performance is off [tonne, s, kJ].
+    """Standard deviation of the error of a predicted performance [tonne, s, kJ].
 
     It is that of one loading on the pile as given, whatever came before, and of what the model
     predicts: where less is there to be loaded, it does not shrink. Differentiable.
@@ -166,10 +155,10 @@ def _deviation(
     """
     if not isinstance(model, Ensemble):
         raise InputError(
-            "the model of this world is a single one and does not tell how far it may be off: "
+            "the model of this world is a single one and does not predict its own error: "
             "train an ensemble with `wlplan train --members 5`"
         )
-    return model.with_deviation(view, action_vector(action))[1]
+    return model.with_deviation(local, action_vector(action))[1]
 
 
 def _above_floor(pile: Pile, pose: Pose) -> Float[Array, "52 52"]:
@@ -237,7 +226,7 @@ def load_world(
             return HybridWorld(predictor, machine=machine, soil=soil)
         place = pretrained_path(others[0]) if pile_state is None else Path(pile_state)
         phi: Any = load_model(place, read_description(place, kind=None)["kind"])
-        if not isinstance(phi, HeightChangeModel | PileStateModel):
+        if not isinstance(phi, PileStatePredictor):
             raise InputError(f"{place}: is not a pile state model: name one of `train phi`.")
         return HighWorld(predictor, phi, machine=machine, soil=soil)
     raise InputError(
