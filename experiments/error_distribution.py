@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.record import described, main
-from experiments.trained import PSI, SHIPPED, SHORT, shipped, trained
+from experiments.trained import PSI, SHIPPED, shipped, shortened, trained
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
@@ -43,7 +43,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     test = split(data)[2]
     test = test.select(test.valid & (test.mass > 0.0))
     compared: dict[str, Any] = {
-        title: trained(models, data, **(PSI[title] | (SHORT if smoke else {})))[0]
+        title: trained(models, data, shortened(PSI[title]) if smoke else PSI[title])[0]
         for title in MODELS
     }
     compared |= {title: shipped(kind)[0] for title, kind in SHIPPED.items()}

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from experiments.record import described, main
-from experiments.trained import SHORT, shipped, trained
+from experiments.trained import shipped, shortened, trained
 from wlplan.constants import QUANTITIES
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.studies.paper import PERFORMANCE
-from wlplan.training import evaluate_performance
+from wlplan.training import KINDS, evaluate_performance
 
 SIZES, SEEDS = (100, 300, 1000, 3000), 3
 MODELS = {"psi_low": "ψ_low", "psi_high": "ψ_high (ours)"}
@@ -44,11 +44,10 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
         for size in (*sizes, None):
             each = []
             for seed in range(seeds):
-                part, settings = (data, {}) if size is None else _part(pool, size, seed)
-                if smoke:
-                    settings = SHORT
+                part, epochs = (data, EPOCHS) if size is None else _part(pool, size, seed)
                 # As the models of `experiments.performance`, which need not be trained again.
-                model, _ = trained(models, part, kind, seed=seed, activation="swish", **settings)
+                settings = KINDS[kind](seed=seed, epochs=epochs)
+                model, _ = trained(models, part, shortened(settings) if smoke else settings)
                 report = evaluate_performance(model, test).every.mean_relative
                 each.append([report[name] for name in NAMES])
             values = np.array(each)
@@ -83,12 +82,12 @@ def _shipped(kind: str, test: Dataset) -> dict[str, Any]:
     }
 
 
-def _part(pool: Dataset, size: int, seed: int) -> tuple[Dataset, dict[str, Any]]:
+def _part(pool: Dataset, size: int, seed: int) -> tuple[Dataset, int]:
     """Random cycles, as many as to have `size` of them used, and how often to go over them."""
     count = min(round(size / _USED), len(pool))
     chosen = np.random.default_rng([seed, size]).choice(len(pool), count, replace=False)
     steps = max(round(_TRAINED * count) // BATCH, 1)
-    return pool.select(np.sort(chosen)), {"epochs": max(EPOCHS, LEAST_STEPS // steps)}
+    return pool.select(np.sort(chosen)), max(EPOCHS, LEAST_STEPS // steps)
 
 
 def draw(folder: Path) -> None:

@@ -34,18 +34,15 @@ from experiments.simulator_gradients import (
     replayed,
     site_of_the_line,
 )
-from experiments.trained import PSI, SHIPPED, SHORT, shipped, trained
+from experiments.trained import PSI, SHIPPED, shipped, shortened, trained
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
 from wlplan.io import write_bytes_atomic
 from wlplan.models.ensemble import Ensemble
 from wlplan.models.performance import PerformanceModel
-from wlplan.models.performance_high import HighPerformanceModel
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, tidy
-from wlplan.terrain.characteristics import as_vector, characteristics
 from wlplan.terrain.heightmap import sample_local
-from wlplan.training.evaluation import sees_map
 from wlplan.types import Pile, Pose
 
 # Parts of a gradient: the poses of the data set lie on the toe, so what the way ahead does has
@@ -69,7 +66,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     """Cosines between the models' gradients and the simulator's differences, and the line."""
     smoke = preset == "smoke"
     chosen = {
-        title: trained(models, data, **(PSI[title] | (SHORT if smoke else {})))[0]
+        title: trained(models, data, shortened(PSI[title]) if smoke else PSI[title])[0]
         for title in MODELS
     }
     chosen |= {title: shipped(kind)[0] for title, kind in SHIPPED.items()}
@@ -98,15 +95,14 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
 
 
 def _outcome(
-    model: PerformanceModel | HighPerformanceModel | Ensemble,
+    model: PerformanceModel | Ensemble,
     height: Array,
     origin: Array,
     vector: Float[Array, "7"],
 ) -> Float[Array, "3"]:
     """Mass, time and work that a model predicts for a pose and an action."""
     local = sample_local(Pile(height, CELL_SIZE, origin), Pose(*vector[:3]))
-    view = local if sees_map(model) else as_vector(characteristics(local))
-    predicted = model(view, vector[3:])
+    predicted = model(local, vector[3:])
     return jnp.stack([predicted.mass, predicted.time, predicted.work])
 
 

@@ -6,6 +6,7 @@ is as in `experiments.performance`: Swish, the whole data set, one training each
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 from pathlib import Path
@@ -17,15 +18,15 @@ from flax import nnx
 
 from experiments.learning_curve import MODELS
 from experiments.record import described, main
-from experiments.trained import SHORT, trained
+from experiments.trained import shortened, trained
 from wlplan.constants import QUANTITIES
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
-from wlplan.studies.bench.inference import inference_times
+from wlplan.studies.bench.inference import performance_times
 from wlplan.studies.paper import PERFORMANCE
-from wlplan.training import evaluate_performance
+from wlplan.training import KINDS, evaluate_performance
 
 LAYERS, UNITS = (1, 2, 3), (8, 32, 128, 512)
 EPOCHS = 150
@@ -40,11 +41,11 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     layers, units = ((1, 2), (8,)) if smoke else (LAYERS, UNITS)
     rows = []
     for kind, count, each in itertools.product(MODELS, layers, units):
-        epochs = SHORT["epochs"] if smoke else EPOCHS
-        model, seconds = trained(
-            models, data, kind, activation="swish", hidden=(each,) * count, epochs=epochs
-        )
-        one, batch = inference_times(model, test)
+        settings = KINDS[kind](epochs=EPOCHS)
+        settings = shortened(settings) if smoke else settings
+        settings = dataclasses.replace(settings, hidden=(each,) * count)
+        model, seconds = trained(models, data, settings)
+        one, batch = performance_times(model, test)
         rows.append(
             {
                 "kind": kind,
@@ -54,7 +55,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
                 "mean_relative": evaluate_performance(model, test).every.mean_relative,
                 "inference_s": one.call.median,
                 "inference_of_a_batch_s": batch.each,
-                "epoch_s": None if seconds is None else seconds / epochs,
+                "epoch_s": None if seconds is None else seconds / settings.epochs,
             }
         )
     return {

@@ -32,11 +32,12 @@ from scipy.spatial import cKDTree
 
 from experiments.record import described, main
 from experiments.replays import in_batches, surfaces
-from experiments.trained import PSI, SHIPPED, SHORT, shipped, trained
+from experiments.trained import PSI, SHIPPED, shipped, shortened, trained
 from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE, QUANTITIES
 from wlplan.dataset import LOADS, Dataset, split
 from wlplan.engines.simulator import dig
 from wlplan.io import write_bytes_atomic
+from wlplan.models.ensemble import Ensemble
 from wlplan.models.performance import PerformanceModel
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, ORANGE, PALE, new_figure, tidy
@@ -68,7 +69,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     random = np.random.default_rng(SEED)
     chosen = test.select(np.sort(random.permutation(len(test))[:cycles]))
     predictors = {
-        title: trained(models, data, **(PSI[title] | (SHORT if smoke else {})))[0]
+        title: trained(models, data, shortened(PSI[title]) if smoke else PSI[title])[0]
         for title in MODELS
     }
     predictors |= {title: shipped(kind)[0] for title, kind in SHIPPED.items()}
@@ -160,7 +161,7 @@ def _alike(chosen: Dataset, data: Dataset, repeats: int) -> Dataset:
     return data.select(np.array(which).reshape(-1))
 
 
-def _excess(model: PerformanceModel, chosen: Dataset, others: Dataset) -> np.ndarray:
+def _excess(model: PerformanceModel | Ensemble, chosen: Dataset, others: Dataset) -> np.ndarray:
     """What the characteristics of others make of the outcome by ψ_low, inverted; [n, R, 3]."""
     repeats = len(others) // len(chosen)
     action = np.repeat(chosen.action, repeats, axis=0)

@@ -6,6 +6,7 @@ same cycles: what ψ_high does better the characteristics do not tell.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from experiments.record import described, main
-from experiments.trained import PSI, SHORT, trained
+from experiments.trained import PSI, shortened, trained
 from wlplan.constants import QUANTITIES
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
@@ -33,12 +34,12 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     test = split(data)[2]
     rows: dict[str, Any] = {}
     for name, settings in PSI.items():
-        papers = "encoder" in settings
+        papers = name.startswith("psi_high of the paper")
         seeds = SEEDS_OF_THE_PAPERS if papers or smoke else SEEDS
         errors, times = [], []
         for seed in range(seeds):
-            chosen: dict[str, Any] = settings | (SHORT if smoke else {})
-            model, seconds = trained(models, data, seed=seed, **chosen)
+            chosen = dataclasses.replace(shortened(settings) if smoke else settings, seed=seed)
+            model, seconds = trained(models, data, chosen)
             times.append(seconds)
             report = evaluate_performance(model, test)
             errors.append(
@@ -65,7 +66,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     low, high = (np.array(rows[f"psi_{k}, swish"]["every"]["each"]) for k in ("low", "high"))
     told = 1.0 - high.mean(axis=0) / low.mean(axis=0)
     paper = {
-        name: PERFORMANCE[settings["kind"], settings["activation"]]._asdict()
+        name: PERFORMANCE[settings.kind, settings.activation]._asdict()
         for name, settings in PSI.items()
     }
     return {

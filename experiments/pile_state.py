@@ -17,16 +17,17 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.record import described, main
-from experiments.trained import SHORT, trained
+from experiments.trained import shortened, trained
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
-from wlplan.models.pile_state import PileStateModel
+from wlplan.models.phi_vae import VaePileStateModel
 from wlplan.models.storage import load_model
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, GREEN, INK, ORANGE, PALE, new_figure, tidy
 from wlplan.studies.paper import PILE_STATE
 from wlplan.terrain.heightmap import STATE_DISPLACEMENT
+from wlplan.training import PhiSettings, PhiVaeSettings, Settings
 from wlplan.training.pile_state import misplaced_volume, pile_state_errors, predict_pile_state
 from wlplan.types import LocalHeightmap
 from wlplan.worlds.library import pretrained_path
@@ -47,13 +48,16 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     smoke = preset == "smoke"
     test = split(data)[2]
     test = test.select(test.valid)
-    short = SHORT if smoke else {}
-    papers, _ = trained(models, data, "phi_vae", **short)
-    ours = [trained(models, data, "phi", seed=s, **short)[0] for s in range(1 if smoke else SEEDS)]
+
+    def of(settings: Settings) -> Any:
+        return trained(models, data, shortened(settings) if smoke else settings)[0]
+
+    papers = of(PhiVaeSettings())
+    ours = [of(PhiSettings(seed=seed)) for seed in range(1 if smoke else SEEDS)]
     ships: Any = load_model(pretrained_path("phi"), "phi")
     # By every training of each; what is drawn is of the first.
     all_predicted = {
-        PLAIN: [predict_pile_state(papers, test, blend=False)],
+        PLAIN: [predict_pile_state(papers.replace(blend=False), test)],
         BLENDED: [predict_pile_state(papers, test)],
         OURS: [predict_pile_state(model, test) for model in ours],
         SHIPS: [predict_pile_state(ships, test)],
@@ -98,7 +102,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
 
 
 def _reconstructed(
-    model: PileStateModel, maps: Float[np.ndarray, "n 52 52"]
+    model: VaePileStateModel, maps: Float[np.ndarray, "n 52 52"]
 ) -> Float[np.ndarray, "n 52 52"]:
     def one(height: jax.Array) -> jax.Array:
         return model.reconstruction(LocalHeightmap(height, CELL_SIZE, STATE_DISPLACEMENT))

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from wlplan.planning.planners.search import SearchSettings
 
 import wlplan
 from experiments.record import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.plan import PLANNERS, play
 from wlplan.planning.planners.gradient import GradientSettings
-from wlplan.planning.planners.search import SearchSettings
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 

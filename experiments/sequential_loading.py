@@ -21,17 +21,17 @@ from jaxtyping import Float
 
 from experiments.error_distribution import STALL
 from experiments.record import described, main
-from experiments.trained import SHORT, trained
+from experiments.trained import shortened, trained
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
 from wlplan.dataset.protocol import Rollout, choose_pose
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic
-from wlplan.models.height_change import HeightChangeModel
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, INK, ORANGE, new_figure, tidy
 from wlplan.studies.paper import SEQUENCE, SEQUENCE_LOADS
+from wlplan.training import PhiSettings, PsiHighSettings, PsiLowSettings, Settings
 from wlplan.types import Action, Performance, Pile, Pose, World, action_from
 from wlplan.worlds.library import HighWorld, HybridWorld, LowWorld, load_world
 
@@ -127,20 +127,16 @@ def learned_worlds(
             continue
     sources = {name: "shipped" if name in worlds else "trained" for name in WORLDS}
     if len(worlds) < len(WORLDS):
-        short = SHORT if smoke else {}
-        psi = {
-            kind: trained(models, data, kind, activation="swish", **short)[0]
-            for kind, needing in (("psi_low", ("low",)), ("psi_high", ("hybrid", "high")))
-            if any(name not in worlds for name in needing)
-        }
+
+        def of(settings: Settings) -> Any:
+            return trained(models, data, shortened(settings) if smoke else settings)[0]
+
         if "low" not in worlds:
-            worlds["low"] = LowWorld(psi["psi_low"])
+            worlds["low"] = LowWorld(of(PsiLowSettings()))
         if "hybrid" not in worlds:
-            worlds["hybrid"] = HybridWorld(psi["psi_high"])
+            worlds["hybrid"] = HybridWorld(of(PsiHighSettings()))
         if "high" not in worlds:
-            phi, _ = trained(models, data, "phi", **short)
-            assert isinstance(phi, HeightChangeModel)
-            worlds["high"] = HighWorld(psi["psi_high"], phi)
+            worlds["high"] = HighWorld(of(PsiHighSettings()), of(PhiSettings()))
     return {name: worlds[name] for name in WORLDS}, sources
 
 

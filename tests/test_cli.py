@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 from pages import Page
 
-from wlplan import cli, dataset, io, training
+from wlplan import cli, dataset, io
 from wlplan.errors import InputError
 from wlplan.planning import objective
 from wlplan.planning import plan as planner
@@ -632,7 +632,6 @@ def test_no_command_shows_the_help(run):
 
 def test_the_names_offered_are_those_that_exist():
     assert cli.options.PROTOCOLS == dataset.PROTOCOLS
-    assert cli.options.LOSSES == training.LOSSES
     assert cli.options.WORLDS == worlds.WORLDS
     assert cli.options.ENGINES == worlds.ENGINES
     assert cli.options.PLANNERS == planner.PLANNERS

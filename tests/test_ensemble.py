@@ -19,12 +19,26 @@ from wlplan.studies.diggability import edge_poses
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import toe_contour
-from wlplan.training import evaluate_performance, fitting, held_out, train_psi_high, train_psi_low
+from wlplan.training import (
+    PsiHighSettings,
+    PsiLowSettings,
+    evaluate_performance,
+    fitting,
+    held_out,
+    train,
+)
 from wlplan.types import LoadingPlan, LocalHeightmap, action_from
 from wlplan.worlds.library import HybridWorld, LowWorld
 
 MEMBERS = 5
-LIGHT = {"epochs": 30, "batch": 160, "hidden": (128,), "learning_rate": 1e-2, "members": MEMBERS}
+LIGHT = {
+    "epochs": 30,
+    "batch": 160,
+    "hidden": (128,),
+    "dropout": 0.0,
+    "learning_rate": 1e-2,
+    "members": MEMBERS,
+}
 ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
 
 
@@ -65,7 +79,7 @@ def data():
 @pytest.fixture(scope="module")
 def saved(data, tmp_path_factory):
     directory = tmp_path_factory.mktemp("ensemble") / "psi_low"
-    model, report = train_psi_low(data, out=directory, dropout=0.0, **LIGHT)
+    model, report = train(PsiLowSettings(**LIGHT), data, out=directory)
     return directory, model, report
 
 
@@ -85,7 +99,9 @@ def test_nine_in_ten_held_out_cycles_lie_inside_the_interval(saved):
 def test_the_deviation_is_that_of_the_data_where_they_scatter_much_and_where_little(saved):
     model = saved[1]
     view = jnp.array([0.4, 0.5, 0.0, 0.0])
-    told = [float(model.with_deviation(view.at[0].set(s), ACTION)[1].mass) for s in (0.25, 0.55)]
+    told = [
+        float(model.of_view_with_deviation(view.at[0].set(s), ACTION)[1].mass) for s in (0.25, 0.55)
+    ]
     true = [scatter(s) for s in (0.25, 0.55)]
     np.testing.assert_allclose(told, true, rtol=0.35)
 
@@ -103,12 +119,12 @@ def test_an_ensemble_is_the_mean_of_its_members_which_differ(saved):
     each = []
     for k in range(model.size):
         params = jax.tree.map(lambda leaf, k=k: leaf[k], model.members.params)
-        each.append(flat(model.members.replace(params=params)(view, ACTION)))
+        each.append(flat(model.members.replace(params=params).of_view(view, ACTION)))
     each = np.stack(each)
     assert len(each) == MEMBERS
     assert (each.std(axis=0) > 1e-4).all()
-    np.testing.assert_allclose(flat(model(view, ACTION)), each.mean(axis=0), rtol=1e-5)
-    mean, deviation = model.with_deviation(view, ACTION)
+    np.testing.assert_allclose(flat(model.of_view(view, ACTION)), each.mean(axis=0), rtol=1e-5)
+    mean, deviation = model.of_view_with_deviation(view, ACTION)
     np.testing.assert_allclose(flat(mean), each.mean(axis=0), rtol=1e-5)
     assert (flat(deviation) > model.factor * each.std(axis=0)).all()
 
@@ -129,7 +145,7 @@ def test_the_gradient_of_mean_and_deviation_is_finite_also_far_from_the_data(sav
     model = saved[1]
     for view in (jnp.zeros(4), jnp.array([0.4, 0.5, 0.0, 0.1]), jnp.full(4, 1e4)):
         slopes = jax.jacrev(
-            lambda v, a: jnp.stack([flat(p) for p in model.with_deviation(v, a)]), (0, 1)
+            lambda v, a: jnp.stack([flat(p) for p in model.of_view_with_deviation(v, a)]), (0, 1)
         )(view, ACTION)
         assert all(np.isfinite(slope).all() for slope in slopes)
 
@@ -161,21 +177,21 @@ def test_a_record_that_does_not_fit_is_refused(saved, tmp_path, change):
 
 @pytest.mark.slow
 def test_a_killed_training_of_an_ensemble_ends_with_the_same_weights(data, tmp_path, monkeypatch):
-    settings = {**LIGHT, "epochs": 4, "hidden": (8,), "dropout": 0.1, "members": 3}
-    few = data.select(data.rollout < 12)
-    check_that_a_killed_one_ends_alike(
-        train_psi_low, few, tmp_path, monkeypatch, settings, {"members": 2}
+    settings = PsiLowSettings(
+        **(LIGHT | {"epochs": 4, "hidden": (8,), "dropout": 0.1, "members": 3})
     )
+    few = data.select(data.rollout < 12)
+    check_that_a_killed_one_ends_alike(few, tmp_path, monkeypatch, settings, members=2)
 
 
-def test_members_have_seeds_of_their_own_and_the_first_has_that_of_the_recipe():
-    seeds = fitting.Recipe(1, 1, 1e-3, seed=7, members=6).seeds
+def test_members_have_seeds_of_their_own_and_the_first_has_that_of_the_training():
+    seeds = fitting.member_seeds(7, 6)
     assert seeds[0] == 7
     assert len(set(seeds)) == 6
-    assert fitting.Recipe(1, 1, 1e-3, seed=7, members=3).seeds == seeds[:3]
-    assert not set(seeds[1:]) & set(fitting.Recipe(1, 1, 1e-3, seed=8, members=6).seeds)
+    assert fitting.member_seeds(7, 3) == seeds[:3]
+    assert not set(seeds[1:]) & set(fitting.member_seeds(8, 6))
     with pytest.raises(InputError, match="members"):
-        fitting.Recipe(1, 1, 1e-3, members=0)
+        PsiLowSettings(members=0)
 
 
 # --- in a world
@@ -198,10 +214,10 @@ def test_a_world_of_an_ensemble_is_a_world_like_any_other(saved, site):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
 
 
-def test_a_world_tells_how_far_it_may_be_off(saved, data, site):
+def test_a_world_predicts_the_deviation_of_its_error(saved, data, site):
     pile, poses = site
     pose = jax.tree.map(lambda leaf: leaf[0], poses)
-    high, _ = train_psi_high(data, dropout=0.0, **{**LIGHT, "epochs": 2, "members": 2})
+    high, _ = train(PsiHighSettings(**(LIGHT | {"epochs": 2, "members": 2})), data)
     for world in (LowWorld(saved[1]), HybridWorld(high)):
 
         @jax.jit
@@ -216,18 +232,18 @@ def test_a_world_tells_how_far_it_may_be_off(saved, data, site):
     assert np.isfinite(flat(deviation)).all()
 
 
-def test_a_world_of_a_single_model_does_not_tell(data, site):
+def test_a_world_of_a_single_model_does_not(data, site):
     pile, poses = site
-    single, _ = train_psi_low(data, **{**LIGHT, "epochs": 1, "members": 1})
+    single, _ = train(PsiLowSettings(**(LIGHT | {"epochs": 1, "members": 1})), data)
     pose = jax.tree.map(lambda leaf: leaf[0], poses)
     with pytest.raises(InputError, match="--members"):
         LowWorld(single).uncertainty(pile, pose, action_from(ACTION))
 
 
 def test_without_intervals_a_report_is_as_it_was(data):
-    single, report = train_psi_low(data, **{**LIGHT, "epochs": 1, "members": 1})
+    single, report = train(PsiLowSettings(**(LIGHT | {"epochs": 1, "members": 1})), data)
     assert report.intervals is None
     assert "intervals" not in report.as_dict()
     assert dataclasses.asdict(report)["intervals"] is None
     with pytest.raises(InputError, match="ensemble"):
-        single.with_variance(jnp.zeros(4), ACTION)
+        single.of_view_with_variance(jnp.zeros(4), ACTION)

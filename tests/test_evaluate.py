@@ -10,8 +10,8 @@ from test_training import synthetic
 
 from wlplan.cli.evaluated import evaluated, print_times
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.performance import PerformanceModel, PsiLow
-from wlplan.models.pile_state import Phi, PileStateModel
+from wlplan.models.phi_vae import PhiVae, VaePileStateModel
+from wlplan.models.psi_low import LowPerformanceModel, PsiLow
 from wlplan.models.storage import load_model, read_description
 from wlplan.studies.bench.inference import BATCH
 from wlplan.studies.paper import PERFORMANCE, PILE_STATE, SEQUENCE, SEQUENCE_LOADS
@@ -28,7 +28,9 @@ def psi_low(data):
     graph, params = nnx.split(PsiLow((8,), rngs=nnx.Rngs(0)))
     ranges = Normaliser.of(jnp.concatenate([data.characteristics, data.action], axis=1))
     table = jnp.stack([data.mass, data.time, data.work], axis=1)
-    return PerformanceModel(params=params, graph=graph, inputs=ranges, outputs=Normaliser.of(table))
+    return LowPerformanceModel(
+        params=params, graph=graph, inputs=ranges, outputs=Normaliser.of(table)
+    )
 
 
 def test_a_performance_predictor_stands_beside_the_papers(data, capsys):
@@ -59,13 +61,13 @@ def test_an_ensemble_is_timed_with_and_without_its_deviation(data, capsys):
 
 
 def test_the_papers_pile_state_model_is_judged_with_and_without_post_processing(data):
-    graph, params = nnx.split(Phi((8,), rngs=nnx.Rngs(0)))
-    model = PileStateModel(params, graph)
+    graph, params = nnx.split(PhiVae((8,), rngs=nnx.Rngs(0)))
+    model = VaePileStateModel(params, graph)
     few = data.select(data.rollout < 1)
     found = evaluated(model, few, {"kind": "phi_vae", "architecture": {}})
     without = found["errors"].pop("without_blending")
     assert found["errors"] == evaluate_pile_state(model, few).as_dict()
-    assert without == evaluate_pile_state(model, few, blend=False).as_dict()
+    assert without == evaluate_pile_state(model.replace(blend=False), few).as_dict()
     assert without["mean_absolute"] != found["errors"]["mean_absolute"]
     assert found["paper"]["without_blending"]["mean_relative"] == 0.0341
 

@@ -1,6 +1,6 @@
 """What the experiments on trained models compute: floors, sums of errors, cosines, kept models."""
 
-import functools
+import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,52 +16,61 @@ from experiments import (
     sequential_loading,
 )
 from experiments.trained import trained
-from wlplan import training
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import fingerprint
+from wlplan.training import PsiLowSettings
 from wlplan.types import Performance
 
 # --- models that are kept
 
 
+def breaks(*_, **__):
+    raise ZeroDivisionError
+
+
 def test_a_model_is_trained_once_and_found_again(tmp_path, monkeypatch):
     data = synthetic(rollouts=10, loads=6)
-    settings = {"activation": "swish", "epochs": 1, "hidden": (4,)}
-    first, seconds = trained(tmp_path, data, "psi_low", **settings)
+    settings = PsiLowSettings(activation="swish", epochs=1, hidden=(4,))
+    first, seconds = trained(tmp_path, data, settings)
     assert seconds > 0.0
     with monkeypatch.context() as patched:
-        refuses = functools.wraps(training.train_psi_low)(lambda *_, **__: 1 / 0)
-        patched.setattr("wlplan.training.train_psi_low", refuses)
-        again, same = trained(tmp_path, data, "psi_low", **settings)
+        patched.setattr("wlplan.training.train", breaks)
+        again, same = trained(tmp_path, data, settings)
         # Swish is the default: to name it makes no other model.
-        trained(tmp_path, data, "psi_low", **{k: settings[k] for k in ("epochs", "hidden")})
+        trained(tmp_path, data, PsiLowSettings(epochs=1, hidden=(4,)))
     assert same == seconds
     inputs = jnp.asarray(data.characteristics[0]), jnp.asarray(data.action[0])
-    assert first(*inputs).mass == again(*inputs).mass
-    trained(tmp_path, data, "psi_low", seed=1, **settings)
-    trained(tmp_path, data.select(data.rollout < 8), "psi_low", **settings)
-    train = training.train_psi_low
-
-    def with_another_default(dataset, *, learning_rate=1e-3, **others):
-        return train(dataset, learning_rate=learning_rate, **others)
-
-    with monkeypatch.context() as patched:
-        patched.setattr("wlplan.training.train_psi_low", with_another_default)
-        trained(tmp_path, data, "psi_low", **settings)
+    assert first.of_view(*inputs).mass == again.of_view(*inputs).mass
+    trained(tmp_path, data, dataclasses.replace(settings, seed=1))
+    trained(tmp_path, data.select(data.rollout < 8), settings)
     names = [path.name for path in tmp_path.iterdir() if path.is_dir()]
-    assert len(names) == 4
-    assert sum(fingerprint(data)[7:15] in name for name in names) == 3
+    assert len(names) == 3
+    assert sum(fingerprint(data)[7:15] in name for name in names) == 2
+
+
+def test_another_default_is_another_model(tmp_path, monkeypatch):
+    data = synthetic(rollouts=10, loads=6)
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class OtherDefault(PsiLowSettings):
+        learning_rate: float = dataclasses.field(
+            default=1e-3,
+            metadata=PsiLowSettings.__dataclass_fields__["learning_rate"].metadata,
+        )
+
+    for settings in (PsiLowSettings, OtherDefault):
+        trained(tmp_path, data, settings(epochs=1, hidden=(4,)))
+    assert len([path for path in tmp_path.iterdir() if path.is_dir()]) == 2
 
 
 def test_a_training_that_was_cut_short_has_no_time(tmp_path, monkeypatch):
     data = synthetic(rollouts=10, loads=6)
-    settings = {"epochs": 1, "hidden": (4,)}
+    settings = PsiLowSettings(epochs=1, hidden=(4,))
     with monkeypatch.context() as patched:
-        fails = functools.wraps(training.train_psi_low)(lambda *_, **__: 1 / 0)
-        patched.setattr("wlplan.training.train_psi_low", fails)
+        patched.setattr("wlplan.training.train", breaks)
         with pytest.raises(ZeroDivisionError):
-            trained(tmp_path, data, "psi_low", **settings)
-    assert trained(tmp_path, data, "psi_low", **settings)[1] is None
+            trained(tmp_path, data, settings)
+    assert trained(tmp_path, data, settings)[1] is None
 
 
 # --- learning curve
@@ -69,13 +78,13 @@ def test_a_training_that_was_cut_short_has_no_time(tmp_path, monkeypatch):
 
 def test_parts_of_the_learning_curve_are_drawn_without_repetition():
     pool = synthetic(rollouts=30, loads=10)
-    part, settings = learning_curve._part(pool, 90, seed=0)
+    part, epochs = learning_curve._part(pool, 90, seed=0)
     assert len(part) == 100
     pairs = np.unique(np.column_stack([part.rollout, part.mass]), axis=0)
     assert len(pairs) == 100
     other, _ = learning_curve._part(pool, 90, seed=1)
     assert fingerprint(part) != fingerprint(other)
-    assert settings["epochs"] == learning_curve.LEAST_STEPS
+    assert epochs == learning_curve.LEAST_STEPS
     whole, _ = learning_curve._part(pool, 10_000, seed=0)
     assert fingerprint(whole) == fingerprint(pool)
 

@@ -8,10 +8,17 @@ from flax import nnx
 
 from wlplan.dataset import VARIABLES, Dataset
 from wlplan.errors import InputError
-from wlplan.models.height_change import HeightChange, HeightChangeModel, Patterns, project
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.performance_high import HighPerformanceModel, PsiHigh
-from wlplan.models.pile_state import Phi, PileStateModel, _gathered, _scattered, blended, scaled
+from wlplan.models.phi import HeightChange, HeightChangeModel, Patterns, project
+from wlplan.models.phi_vae import (
+    PhiVae,
+    VaePileStateModel,
+    _gathered,
+    _scattered,
+    blended,
+    scaled,
+)
+from wlplan.models.psi_high import HighPerformanceModel, PsiHigh
 from wlplan.models.storage import load_model
 from wlplan.site.soil import GRAVEL
 from wlplan.studies.diggability import edge_poses
@@ -19,7 +26,7 @@ from wlplan.terrain.automaton import relax
 from wlplan.terrain.automaton.slopes import steepest_slope
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import toe_contour
-from wlplan.training import evaluate_pile_state, train_phi, train_phi_vae
+from wlplan.training import PhiSettings, PhiVaeSettings, evaluate_pile_state, train
 from wlplan.types import LocalHeightmap, action_from
 from wlplan.worlds.library import HighWorld
 
@@ -136,19 +143,38 @@ def test_scaling_and_blending():
     unit, low, span = scaled(before, jnp.zeros((52, 52)))
     assert (float(unit.min()), float(unit.max())) == (0.0, 1.0)
     np.testing.assert_allclose(low + span * unit, before, atol=1e-6)
-    mixed = blended(after, before)
+    mixed = before + blended(after - before)
     np.testing.assert_array_equal(mixed[0], before[0])
     np.testing.assert_array_equal(mixed[:, -1], before[:, -1])
     np.testing.assert_allclose(mixed[10:-10, 10:-10], after[10:-10, 10:-10], atol=1e-6)
 
 
 def test_the_papers_model_is_finite_on_flat_ground():
-    graph, params = nnx.split(Phi((16,), rngs=nnx.Rngs(0)))
-    model = PileStateModel(params, graph)
+    graph, params = nnx.split(PhiVae((16,), rngs=nnx.Rngs(0)))
+    model = VaePileStateModel(params, graph)
     for height in (jnp.zeros((52, 52)), jnp.asarray(slopes(1)[0][0])):
-        slope = jax.grad(lambda h, a: (model(local(h), a) ** 2).sum(), (0, 1))(height, ACTION)
+        slope = jax.grad(
+            lambda h, a: ((h + model(local(h), a, jnp.zeros(()), h)) ** 2).sum(), (0, 1)
+        )(height, ACTION)
         assert all(np.isfinite(s).all() for s in slope)
     assert float(jnp.abs(slope[1]).max()) > 0.0
+
+
+def test_the_papers_model_predicts_a_change_that_fades_along_the_edges_or_not():
+    graph, params = nnx.split(PhiVae((16,), rngs=nnx.Rngs(0)))
+    model, height = VaePileStateModel(params, graph), jnp.asarray(slopes(1)[0][0])
+    blending, plain = (
+        each(local(height), ACTION, jnp.ones(()), jnp.zeros((52, 52)))
+        for each in (model, model.replace(blend=False))
+    )
+    np.testing.assert_array_equal(blending, blended(plain))
+    np.testing.assert_array_equal(blending[0], 0.0)
+    assert np.any(plain[0] != 0.0)
+
+
+def test_which_predictor_conserves_the_volume_is_said():
+    assert HeightChangeModel.conserves_volume
+    assert not VaePileStateModel.conserves_volume
 
 
 # --- training, worlds
@@ -172,7 +198,7 @@ def data():
 
 def test_training_learns_the_change_and_a_model_comes_back(data, tmp_path):
     settings = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
-    model, errors = train_phi(data, out=tmp_path / "phi", epochs=30, **settings)
+    model, errors = train(PhiSettings(epochs=30, **settings), data, out=tmp_path / "phi")
     unchanged = np.abs(data.h52 - data.h52_after).sum(axis=(1, 2)).mean() * 0.01
     assert errors.mean_absolute < 0.2 * unchanged
     assert abs(errors.total_volume) < 1e-4
@@ -199,10 +225,10 @@ def test_the_errors_are_those_of_the_papers_formulas(data):
 
 
 def test_what_a_code_holds_of_a_map_moves_with_it(data):
-    phi = Phi((8,), rngs=nnx.Rngs(0))
+    phi = PhiVae((8,), rngs=nnx.Rngs(0))
     phi.mean[...] = jnp.asarray(data.h52.mean(axis=0))
     graph, params = nnx.split(phi)
-    model = PileStateModel(params, graph)
+    model = VaePileStateModel(params, graph)
     height = jnp.asarray(data.h52[3])
     held = model.reconstruction(local(height))
     assert held.shape == height.shape
@@ -211,19 +237,14 @@ def test_what_a_code_holds_of_a_map_moves_with_it(data):
     for layer in phi.vae.up:
         layer.kernel[...] = jnp.zeros_like(layer.kernel)
         layer.bias[...] = jnp.zeros_like(layer.bias)
-    empty = PileStateModel(nnx.split(phi)[1], graph).reconstruction(local(height))
+    empty = VaePileStateModel(nnx.split(phi)[1], graph).reconstruction(local(height))
     np.testing.assert_allclose(empty - phi.mean[...], (height - phi.mean[...]).min(), atol=1e-5)
 
 
 def test_both_stages_of_the_paper_are_trained(data, tmp_path):
     done = []
-    _, errors = train_phi_vae(
-        data,
-        out=tmp_path / "vae",
-        epochs=2,
-        hidden=(16,),
-        progress=lambda *n: done.append(n),
-    )
+    settings = PhiVaeSettings(epochs=2, hidden=(16,))
+    _, errors = train(settings, data, out=tmp_path / "vae", progress=lambda *n: done.append(n))
     assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert np.isfinite(errors.mean_absolute)
     load_model(tmp_path / "vae", "phi_vae")
@@ -237,11 +258,13 @@ def psi_high():
     psi.head.output.bias[...] = jnp.full(3, 0.15)
     psi.head.output.kernel[...] = 0.05 * psi.head.output.kernel[...]
     graph, params = nnx.split(psi)
-    ranges = [np.array([[0.0], [2.5]]), np.stack([np.zeros(8), np.ones(8)])]
-    ranges += [np.array([[0.5, 6.0, 100.0], [4.0, 20.0, 900.0]])]
-    return HighPerformanceModel(
-        params, *(Normaliser.of(r.astype(np.float32)) for r in ranges), graph
-    )
+    ranges = {
+        "maps": np.array([[0.0], [2.5]]),
+        "inputs": np.stack([np.zeros(8), np.ones(8)]),
+        "outputs": np.array([[0.5, 6.0, 100.0], [4.0, 20.0, 900.0]]),
+    }
+    normalisers = {name: Normaliser.of(rows.astype(np.float32)) for name, rows in ranges.items()}
+    return HighPerformanceModel(params=params, graph=graph, **normalisers)
 
 
 def first_loading(pile):

@@ -129,24 +129,20 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(tmp_path,
     monkeypatch.setattr(weights, "is_new", lambda path: len(collected) < 5)
     monkeypatch.setattr(weights, "read_attributes", lambda path: {"cycles": 1, "cycles_done": 1})
 
-    def trainer(kind, fails):
-        def train(dataset, *, out, progress, **settings):
-            if fails and not trained.count("broke"):
-                trained.append("broke")
-                raise KeyboardInterrupt
-            trained.append((kind, settings["seed"]))
-            shutil.copytree(pretrained_path(kind), out)
-            document = json.loads((out / "model.json").read_text())
-            document["dataset"]["fingerprints"] = [weights.fingerprint(each) for each in dataset]
-            document["training"] |= settings
-            document["versions"] = weights.versions()
-            (out / "model.json").write_text(json.dumps(document))
-            progress(1, 1)
+    def train(settings, dataset, *, out, progress):
+        if settings.kind == "psi_high" and not trained.count("broke"):
+            trained.append("broke")
+            raise KeyboardInterrupt
+        trained.append((settings.kind, settings.seed))
+        shutil.copytree(pretrained_path(settings.kind), out)
+        document = json.loads((out / "model.json").read_text())
+        document["dataset"]["fingerprints"] = [weights.fingerprint(each) for each in dataset]
+        document["training"]["settings"] = settings.as_dict()
+        document["versions"] = weights.versions()
+        (out / "model.json").write_text(json.dumps(document))
+        progress(1, 1)
 
-        return train
-
-    for kind, (_, settings) in weights._TRAININGS.items():
-        monkeypatch.setitem(weights._TRAININGS, kind, (trainer(kind, kind == "psi_high"), settings))
+    monkeypatch.setattr(weights, "train", train)
     call = {"seed": 3, "progress": lambda *news: told.append(news)}
     with pytest.raises(KeyboardInterrupt):
         train_all(tmp_path / "d.zarr", tmp_path / "out", **call)
@@ -185,4 +181,4 @@ def test_what_was_trained_and_what_was_kept_is_told(tmp_path, monkeypatch, capsy
 
 
 def test_every_model_that_a_world_needs_is_trained():
-    assert set(weights._TRAININGS) == set(SHIPPED)
+    assert {settings.kind for settings in weights.SHIPPED} == set(SHIPPED)

@@ -15,18 +15,20 @@ from wlplan.constants import ACTION_HIGH
 from wlplan.dataset import VARIABLES, Dataset, split
 from wlplan.errors import InputError
 from wlplan.models import storage
-from wlplan.models.performance import PsiLow
+from wlplan.models.psi_low import PsiLow
 from wlplan.models.storage import load_model, read_description, save_model
 from wlplan.training import (
     LOSSES,
+    PsiLowSettings,
     evaluate_performance,
     fitting,
     held_out,
     shares_piles,
-    train_psi_low,
+    train,
 )
 
-LIGHT = {"epochs": 40, "batch": 64, "hidden": (32, 32), "dropout": 0.0, "learning_rate": 1e-2}
+LIGHT = PsiLowSettings(epochs=40, batch=64, hidden=(32, 32), dropout=0.0, learning_rate=1e-2)
+ONE_EPOCH = dataclasses.replace(LIGHT, epochs=1)
 
 
 def synthetic(rollouts=40, loads=15, seed=0):
@@ -60,7 +62,7 @@ def data():
 @pytest.fixture(scope="module")
 def saved(data, tmp_path_factory):
     directory = tmp_path_factory.mktemp("training") / "psi_low"
-    model, report = train_psi_low(data, out=directory, **LIGHT)
+    model, report = train(LIGHT, data, out=directory)
     return directory, model, report
 
 
@@ -105,16 +107,16 @@ def test_training_learns_a_closed_form(saved):
 
 def test_training_reduces_the_loss(data, saved):
     description = read_description(saved[0])["training"]
-    short, _ = train_psi_low(data, **{**LIGHT, "epochs": 1})
+    short, _ = train(ONE_EPOCH, data)
     whole = held_out(data, read_description(saved[0]))
     first = evaluate_performance(short, whole).every.mean_absolute
     assert all(saved[2].every.mean_absolute[name] < 0.5 * first[name] for name in first)
     assert description["best_validation_loss"] <= description["last_validation_loss"]
-    assert 1 <= description["best_epoch"] <= LIGHT["epochs"]
+    assert 1 <= description["best_epoch"] <= LIGHT.epochs
 
 
 def test_the_same_seed_gives_the_same_weights_and_cycles_that_are_not_valid_play_no_role(data):
-    settings = {**LIGHT, "epochs": 2, "dropout": 0.1}
+    settings = dataclasses.replace(LIGHT, epochs=2, dropout=0.1, seed=4)
     done = []
     valid = np.arange(len(data)) % 15 != 0
     models = []
@@ -122,9 +124,7 @@ def test_the_same_seed_gives_the_same_weights_and_cycles_that_are_not_valid_play
         spoilt = dataclasses.replace(
             data, mass=np.where(valid, data.mass, np.float32(wrong)), valid=valid
         )
-        model, report = train_psi_low(
-            spoilt, seed=4, progress=lambda *n: done.append(n), **settings
-        )
+        model, report = train(settings, spoilt, progress=lambda *n: done.append(n))
         assert np.isfinite(report.every.mean_relative["mass"])
         models.append(leaves(model))
     assert done == [(1, 2), (2, 2)] * 2
@@ -159,12 +159,12 @@ def test_the_validation_part_chooses_the_weights():
 
 def test_data_that_cannot_be_trained_on_is_refused(data):
     few = data.select(data.rollout < 2)
-    refused(lambda: train_psi_low(few, **LIGHT), "2 rollouts")
+    refused(lambda: train(LIGHT, few), "2 rollouts")
     holed = dataclasses.replace(data, time=np.where(data.rollout == 3, np.nan, data.time))
-    refused(lambda: train_psi_low(holed, **LIGHT), "not finite")
+    refused(lambda: train(LIGHT, holed), "not finite")
     none = dataclasses.replace(data, valid=np.zeros(len(data), bool))
-    refused(lambda: train_psi_low(none, **LIGHT), "valid")
-    refused(lambda: train_psi_low(data, **{**LIGHT, "epochs": 0}), "at least 1")
+    refused(lambda: train(LIGHT, none), "valid")
+    refused(lambda: dataclasses.replace(LIGHT, epochs=0), "at least 1")
 
 
 # --- evaluation
@@ -172,7 +172,7 @@ def test_data_that_cannot_be_trained_on_is_refused(data):
 
 def test_the_errors_are_what_they_are_called(saved, data):
     _, model, _ = saved
-    p = jax.vmap(model)(jnp.asarray(data.characteristics), jnp.asarray(data.action))
+    p = jax.vmap(model.of_view)(jnp.asarray(data.characteristics), jnp.asarray(data.action))
     mass, time, work = (np.asarray(v) for v in (p.mass, p.time, p.work))
     truth = dataclasses.replace(data, mass=mass / 1.25, time=time - 1.0, work=work)
     errors = evaluate_performance(model, truth).every
@@ -209,7 +209,7 @@ def test_a_data_set_that_begins_with_the_same_piles_is_noticed(data, tmp_path):
     def of_seed(seed):
         return dataclasses.replace(data, attributes={**data.attributes, "seed": seed})
 
-    train_psi_low(of_seed(3), out=tmp_path / "model", **(LIGHT | {"epochs": 1}))
+    train(ONE_EPOCH, of_seed(3), out=tmp_path / "model")
     description = read_description(tmp_path / "model")
     assert description["dataset"]["seeds"] == [3]
     assert shares_piles(of_seed(3).select(data.rollout < 3), description)
@@ -222,8 +222,7 @@ def test_a_data_set_that_begins_with_the_same_piles_is_noticed(data, tmp_path):
 
 def test_of_several_data_sets_each_has_its_own_test_part(data, tmp_path):
     other = synthetic(rollouts=20, seed=1)
-    short = LIGHT | {"epochs": 1}
-    _, report = train_psi_low([data, other], out=tmp_path / "model", **short)
+    _, report = train(ONE_EPOCH, [data, other], out=tmp_path / "model")
     description = read_description(tmp_path / "model")
     parts = [held_out(each, description) for each in (data, other)]
     assert [len(set(part.rollout)) for part in parts] == [
@@ -232,35 +231,35 @@ def test_of_several_data_sets_each_has_its_own_test_part(data, tmp_path):
     assert report.every.cycles == sum(map(len, parts))
     assert len(held_out(synthetic(seed=2), description)) == len(data)
     # Alone, the first data set keeps the same test part: its errors can be compared.
-    train_psi_low(data, out=tmp_path / "alone", **short)
+    train(ONE_EPOCH, data, out=tmp_path / "alone")
     alone = held_out(data, read_description(tmp_path / "alone"))
     np.testing.assert_array_equal(alone.mass, parts[0].mass)
 
 
 def test_data_sets_of_other_soils_are_not_joined(data):
     other = dataclasses.replace(data, attributes={"soil": {"density": 1500.0}})
-    refused(lambda: train_psi_low([data, other], **LIGHT), "soil")
+    refused(lambda: train(LIGHT, [data, other]), "soil")
 
 
-def test_few_cycles_that_are_far_off_do_not_spoil_the_rest(data):
+def test_few_cycles_far_from_the_others_do_not_spoil_the_rest(data):
     random = np.random.default_rng(0)
     stalls = random.random(len(data)) < 0.03
     time = np.where(stalls, data.time + 60.0, data.time).astype(np.float32)
     stalled = dataclasses.replace(data, time=time)
     errors = {}
     for loss in LOSSES:
-        model, _ = train_psi_low(stalled, loss=loss, **LIGHT)
+        model, _ = train(dataclasses.replace(LIGHT, loss=loss), stalled)
         errors[loss] = evaluate_performance(model, data).every.mean_absolute["time"]
     assert errors["huber"] < 0.5 * errors["squared"]
-    refused(lambda: train_psi_low(data, loss="cubed", **LIGHT), "huber, squared")
+    refused(lambda: dataclasses.replace(LIGHT, loss="cubed"), "huber, squared")
 
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_small_errors_count_by_their_square(loss):
     errors = 0.05 * fitting._HUBER * jnp.array([1.0, -2.0])
-    small, double = fitting.of_errors(errors, loss)
+    small, double = fitting.loss_of_errors(errors, loss)
     assert float(double / small) == pytest.approx(4.0, rel=0.02)
-    large, double = fitting.of_errors(jnp.array([10.0, -20.0]), loss)
+    large, double = fitting.loss_of_errors(jnp.array([10.0, -20.0]), loss)
     assert float(double / large) == pytest.approx({"huber": 2.0, "squared": 4.0}[loss], rel=0.02)
 
 
@@ -296,6 +295,7 @@ def test_the_description_says_where_a_model_comes_from(saved, data):
     assert description["dataset"]["soil"] == data.attributes["soil"]
     assert description["dataset"]["fingerprints"][0].startswith("sha256:")
     assert description["held_out"]["loaded"]["mean_relative"]["mass"] < 0.02
+    assert description["training"]["settings"] == LIGHT.as_dict()
     assert set(description["versions"]) >= {"wlplan", "jax", "numpy"}
 
 
@@ -333,9 +333,9 @@ def test_a_failed_save_leaves_the_old_model(copy, saved, monkeypatch):
 
 def test_a_bad_place_is_refused_before_the_training(data, tmp_path):
     done = []
-    call = {**LIGHT, "progress": lambda *n: done.append(n)}
     (tmp_path / "file").write_text("")
-    refused(lambda: train_psi_low(data, out=tmp_path / "file" / "b", **call), "is a file")
+    place = tmp_path / "file" / "b"
+    refused(lambda: train(LIGHT, data, out=place, progress=lambda *n: done.append(n)), "is a file")
     assert not done
 
 

@@ -1,47 +1,48 @@
 """A law of every training: killed, it goes on where it was and ends with the same weights."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
-from wlplan.training import fitting
+from wlplan.training import fitting, train
 
 
 class KilledError(Exception):
     """What ends a training in the middle."""
 
 
-def check_that_a_killed_one_ends_alike(train, data, folder, monkeypatch, settings, other):
+def check_that_a_killed_one_ends_alike(data, folder, monkeypatch, settings, **other):
     """Trains whole, and killed after two of four epochs and again.
 
     Args:
-        train: Trains on `data` with `out`, `progress` and settings; returns model and report.
         data: Data set.
         folder: Folder to write to.
         monkeypatch: Of the test.
         settings: Of the training, with four epochs.
-        other: Settings of another training, which takes nothing over.
+        other: Settings in which another training differs, which takes nothing over.
     """
     monkeypatch.setattr(fitting, "_SAVE_EVERY", 0.0)
-    whole, _ = train(data, out=folder / "whole", **settings)
+    whole, _ = train(settings, data, out=folder / "whole")
 
     def killed(done, _):
         if done == 2:
             raise KilledError
 
-    def epochs(**chosen):
+    def epochs(settings):
         seen = []
-        model, _ = train(data, out=folder / "m", progress=lambda *n: seen.append(n), **chosen)
+        model, _ = train(settings, data, out=folder / "m", progress=lambda *n: seen.append(n))
         return model, seen
 
     with pytest.raises(KilledError):
-        train(data, out=folder / "m", progress=killed, **settings)
+        train(settings, data, out=folder / "m", progress=killed)
     assert (folder / ".m.training.npz").exists()
-    resumed, seen = epochs(**settings)
+    resumed, seen = epochs(settings)
     assert seen == [(3, 4), (4, 4)]
     for got, want in zip(jax.tree.leaves(resumed), jax.tree.leaves(whole), strict=True):
         np.testing.assert_array_equal(got, want)
 
     with pytest.raises(KilledError):
-        train(data, out=folder / "m", progress=killed, **settings)
-    assert len(epochs(**{**settings, **other})[1]) == 4
+        train(settings, data, out=folder / "m", progress=killed)
+    assert len(epochs(dataclasses.replace(settings, **other))[1]) == 4

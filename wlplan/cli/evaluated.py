@@ -16,18 +16,19 @@ def evaluated(model: Any, part: Any, description: Mapping[str, Any]) -> dict[str
     Args:
         model: Predictor of any kind.
         part: Data set of the cycles that it is compared with.
-        description: Description of the model, see `wlplan.training.read_description`.
+        description: Description of the model, see `wlplan.models.storage.read_description`.
     """
-    from wlplan.studies.bench.inference import inference_times
+    from wlplan.studies.bench.inference import performance_times, pile_state_times
     from wlplan.training import evaluate_performance, evaluate_pile_state
 
     kind = description["kind"]
-    times = [time.as_dict() for time in inference_times(model, part)]
     if kind in ("phi", "phi_vae"):
+        times = pile_state_times(model, part)
         errors = evaluate_pile_state(model, part).as_dict()
         # Ours has no post-processing to leave out.
         if kind == "phi_vae":
-            errors["without_blending"] = evaluate_pile_state(model, part, blend=False).as_dict()
+            plainly = model.replace(blend=False)
+            errors["without_blending"] = evaluate_pile_state(plainly, part).as_dict()
         blended, plain = PILE_STATE[True], PILE_STATE[False]
         paper: dict[str, Any] = {
             "mean_absolute": blended.mean_absolute,
@@ -40,13 +41,14 @@ def evaluated(model: Any, part: Any, description: Mapping[str, Any]) -> dict[str
             },
         }
     else:
+        times = performance_times(model, part)
         errors = evaluate_performance(model, part).as_dict()
         result = PERFORMANCE[kind, description["architecture"]["activation"]]
         paper = {
             "mean_relative": {name: getattr(result, name) for name in ("mass", "time", "work")},
             "inference_s": result.inference,
         }
-    return {"errors": errors, "inference": times, "paper": paper}
+    return {"errors": errors, "inference": [time.as_dict() for time in times], "paper": paper}
 
 
 def print_times(times: Sequence[Mapping[str, Any]], paper: float) -> None:

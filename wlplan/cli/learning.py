@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +14,16 @@ from click.core import ParameterSource
 from wlplan.cli.evaluated import evaluated, print_errors, print_pile_state, print_times
 from wlplan.cli.inputs import check_is_folder, site_named
 from wlplan.cli.options import (
-    ACTIVATIONS,
-    ENCODERS,
-    LOSSES,
     PROTOCOLS,
-    LayerUnits,
     ShardNumber,
     site_options,
+    training_options,
     with_options,
 )
 from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.progress import Progress, Stopwatch
 from wlplan.errors import InputError
+from wlplan.training.settings import KINDS
 
 # A data set of so many takes 32 GB.
 _MOST_CYCLES = 1_000_000
@@ -156,23 +155,15 @@ def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
     print(f"{cycles} cycles of {len(parts)} {'shard' if len(parts) == 1 else 'shards'} in {out}")
 
 
-# Names of the models on the command line.
-_KINDS = ("psi-low", "psi-high", "phi", "phi-vae", "all")
-# Options that not every model takes.
-_TAKERS = {
-    "encoder": ("psi-high",),
-    "activation": ("psi-low", "psi-high", "phi"),
-    "hidden": ("psi-low", "psi-high", "phi", "phi-vae"),
-    "dropout": ("psi-low", "psi-high", "phi", "phi-vae"),
-    "members": ("psi-low", "psi-high"),
-    "loss": ("psi-low", "psi-high"),
-}
-# Largest ensemble: beyond some ten members nothing is gained.
-_MOST_MEMBERS = 100
+# Kinds of the models that predict the pile state.
+_PILE_STATE = ("phi", "phi_vae")
+# Kinds of the models by their names on the command line, where one name stands for all that ship.
+_MODELS = {kind.replace("_", "-"): kind for kind in KINDS}
+_ALL = "all"
 
 
 @click.command()
-@click.argument("kind", metavar="MODEL", type=click.Choice(_KINDS))
+@click.argument("model", metavar="MODEL", type=click.Choice((*_MODELS, _ALL)))
 @with_options(
     click.option(
         "--data",
@@ -182,111 +173,53 @@ _MOST_MEMBERS = 100
         help="Data set to train on, or several of them; for all one, collected if it is missing.",
     ),
     click.option("--out", metavar="DIR", required=True, help="Folder of the model, or of all."),
-    click.option(
-        "--epochs",
-        type=click.IntRange(1, 100_000),
-        default=None,
-        help="Passes over the data. Default: psi-low, psi-high 150, phi 100, phi-vae twice 40.",
-    ),
-    click.option(
-        "--activation",
-        type=click.Choice(ACTIVATIONS),
-        default=None,
-        help="Activation function. Default: swish; of phi-vae it is leaky_relu.",
-    ),
-    click.option(
-        "--hidden",
-        type=LayerUnits(),
-        default=None,
-        help="Units of each hidden layer. Default: 512,512; phi-vae 1024,1024.",
-    ),
-    click.option(
-        "--dropout",
-        type=click.FloatRange(0.0, 1.0, max_open=True),
-        default=None,
-        help="Part of the hidden units dropped. Default: psi-low 0.02, phi 0.05, others 0.1.",
-    ),
-    click.option(
-        "--encoder",
-        type=click.Choice(ENCODERS),
-        default=None,
-        help="psi-high: what tells it about the map, the paper's convolutions or (default) ours.",
-    ),
-    click.option(
-        "--loss",
-        type=click.Choice(LOSSES),
-        default=None,
-        help="psi-low, psi-high: what an error counts. Default: huber; squared is the paper's.",
-    ),
-    click.option(
-        "--members",
-        type=click.IntRange(1, _MOST_MEMBERS),
-        default=None,
-        help="psi-low, psi-high: an ensemble of so many, which tells how far it may be off.",
-    ),
+    *training_options(),
 )
 def train(
-    kind: str,
-    data: tuple[str, ...],
-    out: str,
-    epochs: int | None,
-    activation: str | None,
-    hidden: tuple[int, ...] | None,
-    dropout: float | None,
-    encoder: str | None,
-    loss: str | None,
-    members: int | None,
-    seed: int,
-    as_json: bool,
+    model: str, data: tuple[str, ...], out: str, seed: int, as_json: bool, **options: Any
 ) -> None:
     """Train MODEL on a data set and report its errors on cycles that it has not seen.
 
     MODEL is psi-low or psi-high, which predict the performance, phi, which predicts the pile state,
-    or phi-vae, which does so as in the paper; or all: the models that ship, as they ship.
+    or phi-vae, which does so as in the paper; or all: the models that ship, as they ship, of whose
+    settings only --epochs and --seed can be changed.
 
     Interrupted, the same command goes on where it stopped.
     """
-    chosen = {
-        "epochs": epochs,
-        "activation": activation,
-        "hidden": hidden,
-        "dropout": dropout,
-        "encoder": encoder,
-        "loss": loss,
-        "members": members,
-    }
-    settings = {name: value for name, value in chosen.items() if value is not None}
-    for name in settings:
-        if kind not in _TAKERS.get(name, _KINDS):
-            raise InputError(f"--{name} does not go with {kind}: leave it out.")
-    if kind == "all":
+    chosen = {name: value for name, value in options.items() if value is not None}
+    kind = _MODELS.get(model)
+    takes = {"epochs"} if kind is None else {field.name for field in fields(KINDS[kind])}
+    for name in chosen:
+        if name not in takes:
+            option = name.replace("_", "-")
+            raise InputError(f"--{option} does not go with {model}: leave it out.")
+    if kind is None:
         checked_folder(out)
         if len(data) > 1:
             raise InputError("--data names one place for all: the other data sets lie beside it.")
-        _train_all(data[0], out, epochs=epochs, seed=seed, as_json=as_json)
+        _train_all(data[0], out, epochs=chosen.get("epochs"), seed=seed, as_json=as_json)
         return
+    settings = KINDS[kind](seed=seed, **chosen)
     for each in data:
         check_is_folder(each, "data set", "wlplan collect")
     checked_folder(out)
 
-    from wlplan import training as trainers
     from wlplan.dataset import open_dataset
+    from wlplan.training import train as train_model
 
     dataset = [open_dataset(each) for each in data]
-    trainer: Any = getattr(trainers, f"train_{kind.replace('-', '_')}")
     with Progress() as progress, Stopwatch() as training:
-        _, report = trainer(
+        _, report = train_model(
+            settings,
             dataset,
             out=out,
-            seed=seed,
-            **settings,
             progress=lambda done, total: progress("epochs", done, total, None),
         )
     if as_json:
-        click.echo(json_text({"model": kind, "out": out, "held_out": report.as_dict()}))
+        click.echo(json_text({"model": model, "out": out, "held_out": report.as_dict()}))
         return
-    title = f"{kind}, held-out part of {', '.join(data)}"
-    if kind.startswith("phi"):
+    title = f"{model}, held-out part of {', '.join(data)}"
+    if kind in _PILE_STATE:
         print_pile_state(title, [("ours", report.as_dict())])
     else:
         print_errors(title, report.as_dict())
@@ -310,7 +243,7 @@ def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: b
         return
     for kind, report in reports.items():
         title = f"{kind.replace('_', '-')}, held-out parts of {data} and those beside it"
-        if kind == "phi":
+        if kind in _PILE_STATE:
             print_pile_state(title, [("ours", report)])
         else:
             print_errors(title, report)
@@ -366,7 +299,7 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
         return
     which = "held-out part" if len(part) < len(dataset) else "all cycles"
     title = f"{kind}, {which} of {data}"
-    if kind.startswith("phi"):
+    if description["kind"] in _PILE_STATE:
         without = found["errors"].get("without_blending")
         ways = {"edges blended": found["errors"], "as predicted": without}
         rows = {"ours": found["errors"]} if without is None else ways

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import click
@@ -15,13 +16,11 @@ from wlplan.planning.objectives import OBJECTIVES
 from wlplan.plugins import is_reference
 from wlplan.site.machine import MACHINES
 from wlplan.site.soil import SOILS
+from wlplan.training.settings import KINDS, Setting, setting_of
 from wlplan.worlds.names import ENGINES, FOR_PLANNING
 
 # Names that the modules behind define, repeated here to keep help fast; a test compares them.
-ACTIVATIONS = ("swish", "leaky_relu")
-ENCODERS = ("convolutional", "principal")
 PROTOCOLS = ("paper", "corridor", "slow")
-LOSSES = ("huber", "squared")
 
 BUNDLED = "bundled"
 """What stands for the pile that ships with the package where a file is asked for."""
@@ -80,10 +79,19 @@ class ActionNumbers(Numbers):
         return numbers
 
 
-class LayerUnits(click.ParamType):
-    """Units of each hidden layer of a network."""
+class WholeNumbers(click.ParamType):
+    """Whole numbers with commas between them.
+
+    Args:
+        least: Least of each.
+        most: Most of each.
+        entries: How many of them may be given at most.
+    """
 
     name = "N[,N...]"
+
+    def __init__(self, least: int, most: int, entries: int):
+        self._least, self._most, self._entries = least, most, entries
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         """What stands for the value in the help."""
@@ -92,15 +100,18 @@ class LayerUnits(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[int, ...]:
-        """The units of a text; numbers themselves are let pass, as click asks for."""
+        """The numbers of a text; numbers themselves are let pass, as click asks for."""
         if isinstance(value, tuple):
             return value
-        if not re.fullmatch("[0-9]{1,4}(,[0-9]{1,4}){0,7}", str(value)):
+        parts = str(value).split(",")
+        if not all(re.fullmatch("[0-9]{1,9}", part) for part in parts):
             self.fail(f"{value!r} is not of the form {self.name}", param, ctx)
-        units = tuple(map(int, str(value).split(",")))
-        if not 1 <= min(units) <= max(units) <= 4096:
-            self.fail(f"{value!r} holds a layer that has not 1 to 4096 units", param, ctx)
-        return units
+        if len(parts) > self._entries:
+            self.fail(f"{value!r} holds more than {self._entries} numbers", param, ctx)
+        numbers = tuple(map(int, parts))
+        if not self._least <= min(numbers) <= max(numbers) <= self._most:
+            self.fail(f"{value!r} holds a number outside {self._least} to {self._most}", param, ctx)
+        return numbers
 
 
 class ShardNumber(click.ParamType):
@@ -174,6 +185,61 @@ def with_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return command
 
     return decorate
+
+
+def training_options() -> tuple[Callable[[Any], Any], ...]:
+    """An option for each setting of any training, without the seed; what is not given is None.
+
+    The help names the kinds of model that take it, and the default of each.
+    """
+    fields_of: dict[str, dict[str, dataclasses.Field[Any]]] = {}
+    for kind, settings in KINDS.items():
+        for field in dataclasses.fields(settings):
+            fields_of.setdefault(field.name, {})[kind.replace("_", "-")] = field
+    del fields_of["seed"]
+    return tuple(_training_option(name, fields) for name, fields in fields_of.items())
+
+
+def _training_option(
+    name: str, fields: Mapping[str, dataclasses.Field[Any]]
+) -> Callable[[Any], Any]:
+    """The option of a setting, from its field in the settings of each kind that takes it."""
+    first = next(iter(fields.values()))
+    setting = setting_of(first)
+    kinds_of: dict[str, list[str]] = {}
+    for kind, field in fields.items():
+        kinds_of.setdefault(_as_text(field.default), []).append(kind)
+    if len(kinds_of) == 1:
+        default = next(iter(kinds_of))
+    else:
+        default = "; ".join(f"{', '.join(kinds)} {text}" for text, kinds in kinds_of.items())
+    takers = "" if len(fields) == len(KINDS) else f"{', '.join(fields)}: "
+    return click.option(
+        f"--{name.replace('_', '-')}",
+        type=_option_type(setting, first.default),
+        default=None,
+        help=f"{takers}{setting.help} Default: {default}.",
+    )
+
+
+def _option_type(setting: Setting, default: Any) -> click.ParamType:
+    """The click type of a setting, by the type of its default."""
+    if setting.choices:
+        return click.Choice(setting.choices)
+    if isinstance(default, tuple):
+        assert setting.least is not None
+        assert setting.most is not None
+        return WholeNumbers(int(setting.least), int(setting.most), setting.entries)
+    low = setting.least if setting.above is None else setting.above
+    high = setting.most if setting.below is None else setting.below
+    make: Any = click.FloatRange if isinstance(default, float) else click.IntRange
+    return make(low, high, min_open=setting.above is not None, max_open=setting.below is not None)
+
+
+def _as_text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ",".join(map(str, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def loads_option(*, default: int, most: int, remark: str = "") -> Callable[[Any], Any]:

@@ -1,7 +1,7 @@
-"""Ensembles of performance predictors: their mean, and how far it may be off.
+"""Ensembles of performance predictors: their mean, and the standard deviation of its error.
 
-The spread among the members alone tells what the data leave open, and is several times too small:
-it knows nothing of what the inputs do not tell about a loading. So each member has a second layer
+The spread among the members alone shows what the data leave open, and is several times too small:
+it knows nothing of what the inputs do not say about a loading. So each member has a second layer
 of outputs for the variance of its own error (Nix and Weigend 1994), and the variance of the
 ensemble is the mean of theirs and the variance among them (Lakshminarayanan et al. 2017). One
 factor for each output, fitted to cycles that the training did not see, is left to correct.
@@ -9,6 +9,7 @@ factor for each output, fitted to cycles that the training did not see, is left 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, no_type_check
 
 import jax
@@ -17,7 +18,6 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from wlplan.models.performance import PerformanceModel
-from wlplan.models.performance_high import HighPerformanceModel
 from wlplan.types import LocalHeightmap, Performance
 
 PERCENT_90 = 1.6449
@@ -26,9 +26,12 @@ PERCENT_90 = 1.6449
 
 @no_type_check
 class Ensemble(struct.PyTreeNode):
-    """Trained ψ_low or ψ_high that differ in the seed alone. A pytree: all weights are leaves."""
+    """Trained ψ_low or ψ_high that differ in the seed alone. A pytree: all weights are leaves.
 
-    members: PerformanceModel | HighPerformanceModel  # weights with a leading axis
+    What they look at is worked out once for all members, see `PerformanceModel.view`.
+    """
+
+    members: PerformanceModel  # weights with a leading axis
     factor: Float[Array, "3"]  # of the standard deviation of mass, time and work [1]
 
     @property
@@ -36,21 +39,25 @@ class Ensemble(struct.PyTreeNode):
         """Number of members."""
         return len(jax.tree.leaves(self.members.params)[0])
 
-    def __call__(
-        self, view: Float[Array, "4"] | LocalHeightmap, action: Float[Array, "4"]
-    ) -> Performance:
+    @property
+    def view_variable(self) -> str:
+        """Name of the variable of a data set that holds the views."""
+        return self.members.view_variable
+
+    def __call__(self, local: LocalHeightmap, action: Float[Array, "4"]) -> Performance:
         """Mean of the performance that the members predict.
 
         Args:
-            view: What the members look at: the characteristics, or the local heightmap.
+            local: Local heightmap of 36 × 36 cells.
             action: Parameters of the bucket-filling controller.
+
+        Raises:
+            InputError: If the map has another number of cells, or cells of another size.
         """
-        members: Any = self.members
-        each = jax.vmap(lambda params: members.replace(params=params)(view, action))(members.params)
-        return jax.tree.map(lambda values: values.mean(axis=0), each)
+        return self.of_view(self.members.view(local), action)
 
     def with_deviation(
-        self, view: Float[Array, "4"] | LocalHeightmap, action: Float[Array, "4"]
+        self, local: LocalHeightmap, action: Float[Array, "4"]
     ) -> tuple[Performance, Performance]:
         """Mean performance, and the standard deviation of its error [tonne, s, kJ].
 
@@ -58,13 +65,34 @@ class Ensemble(struct.PyTreeNode):
         of the kind that the members were trained on. Differentiable, as the mean is.
 
         Args:
-            view: As for a call.
+            local: As for a call.
+            action: As for a call.
+
+        Raises:
+            InputError: As for a call.
+        """
+        return self.of_view_with_deviation(self.members.view(local), action)
+
+    def of_view(self, view: Array, action: Float[Array, "4"]) -> Performance:
+        """The same as a call, from the view of the local heightmap.
+
+        Args:
+            view: See `PerformanceModel.view`.
             action: As for a call.
         """
-        members: Any = self.members
-        each, own = jax.vmap(
-            lambda params: members.replace(params=params).with_variance(view, action)
-        )(members.params)
+        each = self._by_each(lambda member: member.of_view(view, action))
+        return jax.tree.map(lambda values: values.mean(axis=0), each)
+
+    def of_view_with_deviation(
+        self, view: Array, action: Float[Array, "4"]
+    ) -> tuple[Performance, Performance]:
+        """The same as `with_deviation`, from the view of the local heightmap.
+
+        Args:
+            view: See `PerformanceModel.view`.
+            action: As for a call.
+        """
+        each, own = self._by_each(lambda member: member.of_view_with_variance(view, action))
 
         def deviation(values: Array, variances: Array, factor: Array) -> Array:
             return factor * jnp.sqrt(variances.mean(axis=0) + values.var(axis=0, ddof=1))
@@ -72,6 +100,12 @@ class Ensemble(struct.PyTreeNode):
         return (
             jax.tree.map(lambda values: values.mean(axis=0), each),
             jax.tree.map(deviation, each, own, Performance(*self.factor)),
+        )
+
+    def _by_each(self, predict: Callable[[PerformanceModel], Any]) -> Any:
+        """What each member makes of the same inputs, with a leading axis."""
+        return jax.vmap(lambda params: predict(self.members.replace(params=params)))(
+            self.members.params
         )
 
 

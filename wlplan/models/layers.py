@@ -18,12 +18,7 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from wlplan.errors import InputError
-
-ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
-    "swish": nnx.swish,
-    "leaky_relu": nnx.leaky_relu,
-}
-"""Activation functions of the paper's grid search."""
+from wlplan.models.architecture import ACTIVATIONS
 
 # How far outside the range of the training data an input can get, in units of that range. Our
 # choice: enough for a slope or an action at the very edge of the data, not for another regime.
@@ -79,17 +74,72 @@ class Standardiser(nnx.Module):
 class Mlp(nnx.Module):
     """A multilayer perceptron with dropout behind each hidden layer.
 
-    Inputs and outputs are those of its user, here in units of the range of the training data; in
-    between it works in units of their spread, once `scale_in` and `scale_out` have been fitted.
+    Args:
+        inputs: Length of an input.
+        outputs: Length of an output.
+        hidden: Units of each hidden layer.
+        activation: Name of the activation function, one of
+            `wlplan.models.architecture.ACTIVATIONS`.
+        dropout: Part of the hidden units that is dropped in training.
+        rngs: Random streams of the initial weights.
+
+    Raises:
+        InputError: If the architecture makes no sense.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        hidden: tuple[int, ...],
+        *,
+        activation: str,
+        dropout: float,
+        rngs: nnx.Rngs,
+    ):
+        activation_named(activation)
+        if not hidden or min(hidden) < 1:
+            raise InputError(f"The hidden layers are {hidden}: give at least one, of 1 unit up.")
+        if not 0.0 <= dropout < 1.0:
+            raise InputError(f"The dropout rate is {dropout:g}: it has to be in [0, 1).")
+        widths = (inputs, *hidden)
+        self.hidden = nnx.List(nnx.Linear(n, m, rngs=rngs) for n, m in itertools.pairwise(widths))
+        self.output = nnx.Linear(widths[-1], outputs, rngs=rngs)
+        # Without streams of its own it holds no state: the weights are all there is to save.
+        self.dropout = nnx.Dropout(dropout)
+        self.activation = activation
+
+    def __call__(
+        self, inputs: Float[Array, "*batch n"], *, rngs: nnx.Rngs | None = None
+    ) -> Float[Array, "*batch m"]:
+        """Outputs of the last, linear layer; `rngs` switches dropout on."""
+        return self.output(self.last_hidden(inputs, rngs=rngs))
+
+    def last_hidden(
+        self, inputs: Float[Array, "*batch n"], *, rngs: nnx.Rngs | None = None
+    ) -> Float[Array, "*batch k"]:
+        """Outputs of the last hidden layer; `rngs` switches dropout on."""
+        x = inputs
+        for layer in self.hidden:
+            x = activation_named(self.activation)(layer(x))
+            x = self.dropout(x, deterministic=rngs is None, rngs=rngs)
+        return x
+
+
+class StandardisedMlp(Mlp):
+    """A multilayer perceptron that works in units of the spread of the training data.
+
+    Inputs and outputs are those of its user, in units of the range of the training data.
+    `scale_in` and `scale_out` have to be fitted before it is trained.
 
     Args:
         inputs: Length of an input.
         outputs: Length of an output.
         hidden: Units of each hidden layer.
-        activation: Name of the activation function, one of `ACTIVATIONS`.
+        activation: Name of the activation function, one of
+            `wlplan.models.architecture.ACTIVATIONS`.
         dropout: Part of the hidden units that is dropped in training.
-        standardised: False: without the two scalings, as the first models were.
-        scattered: True: with a second layer of outputs, that tells how far they may be off, see
+        scattered: Whether a second layer of outputs predicts the variance of its errors, see
             `outputs_and_variances`.
         rngs: Random streams of the initial weights.
 
@@ -105,75 +155,61 @@ class Mlp(nnx.Module):
         *,
         activation: str,
         dropout: float,
-        standardised: bool = True,
         scattered: bool = False,
         rngs: nnx.Rngs,
     ):
-        check_activation(activation)
-        if not hidden or min(hidden) < 1:
-            raise InputError(f"The hidden layers are {hidden}: give at least one, of 1 unit up.")
-        if not 0.0 <= dropout < 1.0:
-            raise InputError(f"The dropout rate is {dropout:g}: it has to be in [0, 1).")
-        widths = (inputs, *hidden)
-        self.hidden = nnx.List(nnx.Linear(n, m, rngs=rngs) for n, m in itertools.pairwise(widths))
-        self.output = nnx.Linear(widths[-1], outputs, rngs=rngs)
-        self.scatter = nnx.Linear(widths[-1], outputs, rngs=rngs) if scattered else None
-        # Without streams of its own it holds no state: the weights are all there is to save.
-        self.dropout = nnx.Dropout(dropout)
-        self.activation = activation
-        self.scale_in = Standardiser(inputs) if standardised else None
-        self.scale_out = Standardiser(outputs) if standardised else None
+        super().__init__(inputs, outputs, hidden, activation=activation, dropout=dropout, rngs=rngs)
+        self.scatter = nnx.Linear(hidden[-1], outputs, rngs=rngs) if scattered else None
+        self.scale_in = Standardiser(inputs)
+        self.scale_out = Standardiser(outputs)
 
     def __call__(
         self, inputs: Float[Array, "*batch n"], *, rngs: nnx.Rngs | None = None
     ) -> Float[Array, "*batch m"]:
         """Outputs of the last, linear layer; `rngs` switches dropout on."""
-        return self._restored(self.output(self._hidden(inputs, rngs)))
+        x = self.last_hidden(self.scale_in.standardise(inputs), rngs=rngs)
+        return self.scale_out.restore(self.output(x))
 
     def outputs_and_variances(
         self, inputs: Float[Array, "*batch n"], *, rngs: nnx.Rngs | None = None
     ) -> tuple[Float[Array, "*batch m"], Float[Array, "*batch m"]]:
-        """Outputs, and the variance of what they are off, in units of their squared spread.
+        """Outputs, and the variances of their errors in units of their squared spread.
 
         Raises:
-            InputError: If the network has no layer for it.
+            InputError: If the network has no layer for the variances.
         """
         if self.scatter is None:
-            raise InputError("This network does not tell how far it may be off: train an ensemble.")
-        x = self._hidden(inputs, rngs)
-        # What tells the scatter must not make the hidden layers worse at telling the outputs.
+            raise InputError(
+                "This network does not predict the variance of its errors: train an ensemble."
+            )
+        x = self.last_hidden(self.scale_in.standardise(inputs), rngs=rngs)
+        # What predicts the scatter must not make the hidden layers worse at predicting the outputs.
         # Bounded, so that no step of the training can make it overflow.
         exponent = self.scatter(jax.lax.stop_gradient(x)) / _LARGEST_EXPONENT
         variances = _USUAL_VARIANCE * jnp.exp(_LARGEST_EXPONENT * jnp.tanh(exponent))
-        return self._restored(self.output(x)), variances
-
-    def _hidden(self, inputs: Array, rngs: nnx.Rngs | None) -> Array:
-        x = inputs if self.scale_in is None else self.scale_in.standardise(inputs)
-        for layer in self.hidden:
-            x = ACTIVATIONS[self.activation](layer(x))
-            x = self.dropout(x, deterministic=rngs is None, rngs=rngs)
-        return x
-
-    def _restored(self, outputs: Array) -> Array:
-        return outputs if self.scale_out is None else self.scale_out.restore(outputs)
+        return self.scale_out.restore(self.output(x)), variances
 
     def in_spreads(self, errors: Float[Array, "*batch m"]) -> Float[Array, "*batch m"]:
         """Errors of the outputs in units of their spread."""
-        return errors if self.scale_out is None else self.scale_out.in_spreads(errors)
+        return self.scale_out.in_spreads(errors)
 
     def of_spreads(self, errors: Float[Array, "*batch m"]) -> Float[Array, "*batch m"]:
         """The inverse of `in_spreads`."""
-        return errors if self.scale_out is None else self.scale_out.of_spreads(errors)
+        return self.scale_out.of_spreads(errors)
 
 
-def check_activation(name: str) -> None:
-    """Refuses an activation function that is not one of `ACTIVATIONS`.
+def activation_named(name: str) -> Callable[[Array], Array]:
+    """An activation function.
+
+    Args:
+        name: One of `wlplan.models.architecture.ACTIVATIONS`.
 
     Raises:
-        InputError: If so.
+        InputError: If it is none of them.
     """
     if name not in ACTIVATIONS:
         raise InputError(f"Unknown activation {name!r}: choose one of {', '.join(ACTIVATIONS)}.")
+    return getattr(nnx, name)
 
 
 def soft_clamp(values: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -229,8 +265,8 @@ def principal_components(rows: Float[Array, "n k"], count: int) -> Float[Array, 
     if n < k:
         values, vectors = jnp.linalg.eigh(rows @ rows.T)
         lengths = jnp.sqrt(jnp.maximum(values, 0.0))
-        told = lengths > 1e-5 * lengths[-1]
-        scale = jnp.where(told, 1.0 / jnp.where(told, lengths, 1.0), 0.0)
+        distinct = lengths > 1e-5 * lengths[-1]
+        scale = jnp.where(distinct, 1.0 / jnp.where(distinct, lengths, 1.0), 0.0)
         vectors = rows.T @ (vectors * jnp.broadcast_to(scale, vectors.shape))
     else:
         _, vectors = jnp.linalg.eigh(rows.T @ rows)

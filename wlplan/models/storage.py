@@ -1,4 +1,8 @@
-"""Models on disk: an orbax checkpoint of the weights, and a description of them."""
+"""Models on disk: a directory with an orbax checkpoint of the weights, and `model.json`.
+
+The latter says what the weights are, where they come from, how good they are, and which bytes
+belong to them.
+"""
 
 from __future__ import annotations
 
@@ -8,92 +12,90 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from wlplan.constants import CELL_SIZE
 from wlplan.errors import InputError
 from wlplan.io.provenance import command, versions
 from wlplan.models.ensemble import Ensemble, members_of
-from wlplan.models.height_change import HeightChange, HeightChangeModel
+from wlplan.models.grid import GRID
+from wlplan.models.layers import Mlp
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel, PsiLow
-from wlplan.models.performance_high import HighPerformanceModel, PsiHigh
-from wlplan.models.pile_state import Phi, PileStateModel
-from wlplan.terrain.heightmap import (
-    PERFORMANCE_CELLS,
-    PERFORMANCE_DISPLACEMENT,
-    STATE_CELLS,
-    STATE_DISPLACEMENT,
-)
+from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel
+from wlplan.models.phi import HeightChange, HeightChangeModel
+from wlplan.models.phi_vae import PhiVae, VaePileStateModel
+from wlplan.models.psi_high import HighPerformanceModel, PsiHigh
+from wlplan.models.psi_low import LowPerformanceModel, PsiLow
 
 MODEL_FORMAT = "wlplan.model/1"
 
-Model = PerformanceModel | HighPerformanceModel | HeightChangeModel | PileStateModel | Ensemble
-
-GRID: dict[str, float] = {
-    "cell_size": CELL_SIZE,
-    "performance_cells": PERFORMANCE_CELLS,
-    "performance_displacement": PERFORMANCE_DISPLACEMENT,
-    "state_cells": STATE_CELLS,
-    "state_displacement": STATE_DISPLACEMENT,
-}
-"""The local maps that the models look at: spacing [m], cells a side, displacement [m]."""
+Model = PerformanceModel | HeightChangeModel | VaePileStateModel | Ensemble
 
 _DESCRIPTION, _WEIGHTS = "model.json", "weights"
 
-# Of each kind: the model, its network, and the normalisers with the numbers in each.
-_KINDS: dict[str, tuple[Any, Any, dict[str, int]]] = {
-    "psi_low": (PerformanceModel, PsiLow, {"inputs": INPUTS, "outputs": OUTPUTS}),
-    "psi_high": (HighPerformanceModel, PsiHigh, {"maps": 1, "inputs": INPUTS, "outputs": OUTPUTS}),
-    "phi": (HeightChangeModel, HeightChange, {}),
-    "phi_vae": (PileStateModel, Phi, {}),
+
+class _Kind(NamedTuple):
+    """What belongs to a kind of model. Its name is what is saved; those of the classes are not."""
+
+    model: Any
+    network: Any
+    perceptron: Callable[[Any], Mlp]  # of a network, the part that has hidden layers
+    normalisers: dict[str, int]  # fields of the model, and how many numbers are in each
+
+
+_KINDS = {
+    "psi_low": _Kind(
+        LowPerformanceModel,
+        PsiLow,
+        lambda network: network,
+        {"inputs": INPUTS, "outputs": OUTPUTS},
+    ),
+    "psi_high": _Kind(
+        HighPerformanceModel,
+        PsiHigh,
+        lambda network: network.head,
+        {"maps": 1, "inputs": INPUTS, "outputs": OUTPUTS},
+    ),
+    "phi": _Kind(HeightChangeModel, HeightChange, lambda network: network.weights, {}),
+    "phi_vae": _Kind(VaePileStateModel, PhiVae, lambda network: network.step, {}),
 }
 
 
 def kind_of(model: Model) -> str:
     """The name under which a model is saved."""
     made = type(members_of(model))
-    return next(kind for kind, (known, _, _) in _KINDS.items() if known is made)
-
-
-def kind_of_network(network: Any) -> str:
-    """The name under which the model of a network is saved."""
-    return next(kind for kind, (_, made, _) in _KINDS.items() if isinstance(network, made))
+    return next(name for name, kind in _KINDS.items() if kind.model is made)
 
 
 def architecture(network: Any) -> dict[str, Any]:
-    """What a network has to be built with anew."""
-    kind = kind_of_network(network)
-    parts = {"psi_high": "head", "phi": "weights", "phi_vae": "step"}
-    perceptron = getattr(network, parts[kind]) if kind in parts else network
+    """What a network has to be built with anew: arguments of its class, as JSON has them."""
+    kind = next(kind for kind in _KINDS.values() if isinstance(network, kind.network))
+    perceptron: Any = kind.perceptron(network)
     record = {
         "hidden": [layer.out_features for layer in perceptron.hidden],
         "dropout": perceptron.dropout.rate,
     }
-    if kind != "phi_vae":
+    # The paper's φ has one activation function only.
+    if not isinstance(network, PhiVae):
         record["activation"] = perceptron.activation
-    if kind == "psi_low":
-        record["standardised"] = network.scale_in is not None
-    if kind == "psi_high":
+    if isinstance(network, PsiHigh):
         record["encoder"] = network.encoder_name
-    if kind in ("psi_low", "psi_high"):
+    if isinstance(network, PsiLow | PsiHigh):
         record["scattered"] = perceptron.scatter is not None
     return record
 
 
 def _network(kind: str, record: Mapping[str, Any]) -> Any:
-    settings = {**record, "hidden": tuple(record["hidden"])}
-    if kind == "psi_low":
-        # Models of before the standardisation do not name it.
-        settings.setdefault("standardised", False)
-    return _KINDS[kind][1](rngs=nnx.Rngs(0), **settings)
+    arguments = {**record, "hidden": tuple(record["hidden"])}
+    # The record of the ψ_low that ships says that it is standardised, as all are.
+    arguments.pop("standardised", None)
+    return _KINDS[kind].network(rngs=nnx.Rngs(0), **arguments)
 
 
 def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[str, Any]) -> None:
@@ -132,7 +134,8 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
                 "kind": kind,
                 "architecture": architecture(network),
                 "normaliser": {
-                    name: _normaliser_to_dict(getattr(member, name)) for name in _KINDS[kind][2]
+                    name: _normaliser_to_dict(getattr(member, name))
+                    for name in _KINDS[kind].normalisers
                 },
                 "grid": GRID,
                 **({"ensemble": _ensemble_to_dict(model)} if isinstance(model, Ensemble) else {}),
@@ -177,11 +180,10 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
 
     directory = Path(directory)
     description = read_description(directory, kind)
-    # Models of before it was recorded do not name their grid; there has been one only.
-    if description.get("grid", GRID) != GRID:
+    if (grid := description.get("grid")) != GRID:
         raise InputError(
             f"{directory}: was trained on local maps of another grid than today's "
-            f"({_of_grid(description['grid'])}): train it again."
+            f"({_of_grid(grid)}): train it again."
         )
     try:
         shape = description["architecture"]
@@ -193,7 +195,7 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
             )
         normalisers = {
             name: _normaliser_of_dict(description["normaliser"][name], size)
-            for name, size in _KINDS[kind][2].items()
+            for name, size in _KINDS[kind].normalisers.items()
         }
         # Checked before orbax reads them: it would report damage at length, or wait.
         if _digests(directory / _WEIGHTS) != description["files"]:
@@ -213,7 +215,7 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
         what = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{directory}: is damaged ({what}): copy or train it again.") from error
     nnx.replace_by_pure_dict(params, jax.tree.map(jnp.asarray, weights))
-    model = _KINDS[kind][0](params=params, graph=graph, **normalisers)
+    model = _KINDS[kind].model(params=params, graph=graph, **normalisers)
     return Ensemble(model, factor) if members else model
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -10,13 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from wlplan.constants import CELL_SIZE, QUANTITIES
-from wlplan.dataset import Dataset
+from wlplan.constants import QUANTITIES
+from wlplan.dataset import Dataset, fingerprint, split
 from wlplan.errors import InputError
-from wlplan.models.ensemble import PERCENT_90, Ensemble, members_of
+from wlplan.models.ensemble import PERCENT_90, Ensemble
 from wlplan.models.performance import PerformanceModel
-from wlplan.models.performance_high import HighPerformanceModel
-from wlplan.types import LocalHeightmap, Performance
+from wlplan.types import Performance
 
 # Load from which an error relative to it says something [tonne]: a sixth of a full bucket. Of a
 # bucket that comes out nearly empty any error is many times the load.
@@ -40,13 +40,13 @@ class Errors:
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """How the errors of an ensemble in one quantity agree with what it tells about them."""
+    """How the errors of an ensemble in one quantity agree with the deviations that it predicts."""
 
     # Part of the cycles inside the interval that ought to hold 0.9 of them [1].
     coverage: float
-    # The same of fifths of the cycles, from the least deviation that is told to the largest.
+    # The same of fifths of the cycles, from the least predicted deviation to the largest.
     coverage_by_fifths: list[float]
-    # Root mean square of the deviations that are told, and of the errors, of each fifth.
+    # Root mean square of the predicted deviations, and of the errors, of each fifth.
     deviation_by_fifths: list[float]
     error_by_fifths: list[float]
 
@@ -67,9 +67,36 @@ class EvaluationReport:
         return record if self.intervals else {k: v for k, v in record.items() if k != "intervals"}
 
 
-def evaluate_performance(
-    model: PerformanceModel | HighPerformanceModel | Ensemble, dataset: Dataset
-) -> EvaluationReport:
+def held_out(dataset: Dataset, description: Mapping[str, Any]) -> Dataset:
+    """The cycles of a data set that a model was not trained on.
+
+    Args:
+        dataset: Any data set.
+        description: Description of the model, see `read_description`.
+
+    Returns:
+        Of a data set that the model was trained on, the test part; of another, everything.
+    """
+    if fingerprint(dataset) not in description.get("dataset", {}).get("fingerprints", ()):
+        return dataset
+    return split(dataset, fractions=tuple(description["training"]["fractions"]))[2]
+
+
+def shares_piles(dataset: Dataset, description: Mapping[str, Any]) -> bool:
+    """Whether a model was trained on a data set of the same seed.
+
+    Data sets of one seed begin with the same piles and actions, whatever their protocol and size:
+    of a data set that the model was not trained on, it still knows piles.
+
+    Args:
+        dataset: Any data set.
+        description: Description of the model, see `read_description`.
+    """
+    seed = dataset.attributes.get("seed")
+    return seed is not None and seed in description.get("dataset", {}).get("seeds", ())
+
+
+def evaluate_performance(model: PerformanceModel | Ensemble, dataset: Dataset) -> EvaluationReport:
     """Compares a model with the simulated cycles of a data set, or of a part of one.
 
     Errors relative to the load of a nearly empty bucket are large whatever the model does, so the
@@ -144,32 +171,24 @@ def widening(ensemble: Ensemble, dataset: Dataset) -> Float[Array, "3"]:
     return jnp.asarray(np.array(factors, np.float32))
 
 
-def sees_map(model: PerformanceModel | HighPerformanceModel | Ensemble) -> bool:
-    """Whether a model is called with the local map; else with its four characteristics."""
-    return isinstance(members_of(model), HighPerformanceModel)
-
-
-def predict(
-    model: PerformanceModel | HighPerformanceModel | Ensemble, dataset: Dataset
-) -> Performance:
+def predict(model: PerformanceModel | Ensemble, dataset: Dataset) -> Performance:
     """The performance that a model predicts for each cycle; leaves of shape [n]."""
     return predict_with_deviation(model, dataset)[0]
 
 
 def predict_with_deviation(
-    model: PerformanceModel | HighPerformanceModel | Ensemble, dataset: Dataset
+    model: PerformanceModel | Ensemble, dataset: Dataset
 ) -> tuple[Performance, Performance | None]:
     """Prediction of each cycle and, by an ensemble, its standard deviation; leaves of shape [n]."""
-    views = dataset.h36 if sees_map(model) else dataset.characteristics
+    views = getattr(dataset, model.view_variable)
     return _of_views(model, jnp.asarray(views), jnp.asarray(dataset.action))
 
 
 @jax.jit
 def _of_views(model: Any, views: Array, action: Array) -> tuple[Performance, Performance | None]:
     def one(cycle: tuple[Array, Array]) -> tuple[Performance, Performance | None]:
-        view = cycle[0] if cycle[0].ndim == 1 else LocalHeightmap(cycle[0], CELL_SIZE, 0.0)
         if isinstance(model, Ensemble):
-            return model.with_deviation(view, cycle[1])
-        return model(view, cycle[1]), None
+            return model.of_view_with_deviation(*cycle)
+        return model.of_view(*cycle), None
 
     return jax.lax.map(one, (views, action), batch_size=_CHUNK)

@@ -8,7 +8,7 @@ import hashlib
 import io
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from wlplan.errors import InputError
 from wlplan.io.files import write_bytes_atomic
+from wlplan.training.settings import Settings
 from wlplan.types import PyTree
 
 # Part of the steps over which the learning rate rises before its cosine decay. Our choice; the
@@ -36,12 +37,9 @@ _ENOUGH = 20_000
 # Least time between two saved states [s].
 _SAVE_EVERY = 30.0
 
-LOSSES = ("huber", "squared")
-"""What counts of an error: beyond a twentieth of the spread its size, below that its square; or
-always its square, as in the paper. Three cycles in a hundred stall and take far longer than the
-rest. They weigh so much by the square that all others suffer: ψ_low errs by 5.9 % in time; by
-Huber's loss 3.1 %.
-"""
+OPTIMISER = "AdamW, cosine schedule"
+"""The optimiser, as `model.json` names it."""
+
 # Error from which on the size counts, in units of the spread. With a fifth ψ_high errs by a tenth
 # more.
 _HUBER = 0.05
@@ -50,38 +48,15 @@ Loss = Callable[[Any, PyTree, nnx.Rngs | None], Array]
 """Mean loss of a network over examples; without random streams, as in use and not in training."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Recipe:
-    """How long and how fast a network is fitted."""
+def member_seeds(seed: int, members: int) -> list[int]:
+    """The seed of each member of an ensemble; that of the first is the given one.
 
-    epochs: int
-    batch: int  # examples a step; at most those there are
-    learning_rate: float  # at its peak
-    weight_decay: float = 1e-2
-    seed: int = 0  # of the initial weights, the order of the examples and the dropout
-    members: int = 1  # networks that are fitted side by side
-    loss: str = "squared"  # one of LOSSES
-
-    def __post_init__(self) -> None:
-        if self.epochs < 1 or self.batch < 1:
-            raise InputError(
-                f"{self.epochs} epochs of batches of {self.batch} asked for: both have to be at "
-                f"least 1."
-            )
-        if self.members < 1:
-            raise InputError(f"{self.members} members asked for: there has to be at least 1.")
-        if self.loss not in LOSSES:
-            raise InputError(f"Unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}.")
-
-    @property
-    def seeds(self) -> list[int]:
-        """The seed of each member; that of the first is the recipe's own."""
-        others = np.random.SeedSequence(self.seed).generate_state(self.members - 1)
-        return [self.seed, *(int(number) >> 1 for number in others)]
-
-    def as_dict(self) -> dict[str, Any]:
-        """The recipe as `model.json` has it."""
-        return {"optimiser": "AdamW, cosine schedule", **dataclasses.asdict(self)}
+    Args:
+        seed: Seed of the training.
+        members: Number of members; with more of them, the seeds of the first stay the same.
+    """
+    others = np.random.SeedSequence(seed).generate_state(members - 1)
+    return [seed, *(int(number) >> 1 for number in others)]
 
 
 @jax.tree_util.register_dataclass
@@ -145,8 +120,8 @@ class SavedState:
         self._path.unlink(missing_ok=True)
 
 
-def of_errors(errors: Float[Array, "*n"], loss: str) -> Float[Array, "*n"]:
-    """What each error counts, see `LOSSES`.
+def loss_of_errors(errors: Float[Array, "*n"], loss: str) -> Float[Array, "*n"]:
+    """How much each error counts in the loss, see `LOSSES`.
 
     Args:
         errors: Errors in units of the spread.
@@ -157,7 +132,7 @@ def of_errors(errors: Float[Array, "*n"], loss: str) -> Float[Array, "*n"]:
     return jnp.sqrt(errors**2 + _HUBER**2) - _HUBER
 
 
-def evenly(table: Mapping[str, Any]) -> dict[str, Array]:
+def even_sample(table: Mapping[str, Any]) -> dict[str, Array]:
     """Rows of a table, evenly spread over it, that are enough to take scales and components from.
 
     Up to 40,000 rows these are all of them.
@@ -172,12 +147,12 @@ def mirror_some(key: Array, maps: Float[Array, "n i j"]) -> tuple[Array, Bool[Ar
     return jnp.where(mirrored[:, None, None], maps[:, :, ::-1], maps), mirrored
 
 
-def fitted(
-    networks: nnx.Module | list[nnx.Module],
+def fit_network(
+    networks: Sequence[nnx.Module],
     loss: Loss,
     train: PyTree,
     validation: PyTree,
-    recipe: Recipe,
+    settings: Settings,
     *,
     augment: Callable[[Array, PyTree], PyTree] | None = None,
     state: SavedState | None = None,
@@ -190,33 +165,35 @@ def fitted(
     are compiled once.
 
     Args:
-        networks: Network to start from, or those of all members.
+        networks: Network to start from, or those of all members of an ensemble.
         loss: Loss to reduce.
         train: Examples, leaves with one leading axis.
         validation: Examples that choose among the epochs.
-        recipe: How long and how fast.
+        settings: How long and how fast.
         augment: Changes the examples of a step at random.
         state: Where an unfinished training is kept.
         progress: Called with the number of epochs done and in all.
 
     Returns:
-        The state with the least validation loss, of members stacked, and a record of the training.
+        The state with the least validation loss, of several networks stacked, and a record of the
+        training.
 
     Raises:
         InputError: If the training diverges.
     """
-    seeds = recipe.seeds if isinstance(networks, list) else [recipe.seed]
-    parts = [_split(n) for n in (networks if isinstance(networks, list) else [networks])]
+    alone = len(networks) == 1
+    parts = [_split(network) for network in networks]
+    seeds = member_seeds(settings.seed, len(parts))
     graph = parts[0][0]
     count = len(jax.tree.leaves(train)[0])
-    batch = min(recipe.batch, count)
-    steps = recipe.epochs * (count // batch)
+    batch = min(settings.batch, count)
+    steps = settings.epochs * (count // batch)
     rate = optax.warmup_cosine_decay_schedule(
-        0.0, recipe.learning_rate, int(_WARM_UP * steps), max(steps, 1)
+        0.0, settings.learning_rate, int(_WARM_UP * steps), max(steps, 1)
     )
     optimiser = optax.chain(
         optax.clip_by_global_norm(_LARGEST_GRADIENT),
-        optax.adamw(rate, weight_decay=recipe.weight_decay),
+        optax.adamw(rate, weight_decay=settings.weight_decay),
     )
     run_epoch: Any = partial(_epoch, graph, loss, optimiser, batch, augment)
 
@@ -226,28 +203,28 @@ def fitted(
 
     fit: Any = [start(params, rest) for _, params, rest in parts]
     keys: Any = [jax.random.key(seed) for seed in seeds]
-    if isinstance(networks, list):
+    if alone:
+        fit, keys = fit[0], keys[0]
+    else:
         run_epoch = jax.vmap(run_epoch, in_axes=(0, 0, None, None, None))
         fit, keys = jax.tree.map(lambda *leaves: jnp.stack(leaves), *fit), jnp.stack(keys)
-    else:
-        fit, keys = fit[0], keys[0]
     run_epoch = jax.jit(run_epoch)
     losses: Any = np.full((*keys.shape, 2), np.inf)
     done = 0
     if state is not None and (found := state.load(fit)) is not None:
         fit, done, losses = found
-    while done < recipe.epochs:
+    while done < settings.epochs:
         fit, losses = run_epoch(fit, keys, jnp.asarray(done), train, validation)
         done += 1
         if state is not None:
-            state.save(fit, done, losses, now=done == recipe.epochs)
+            state.save(fit, done, losses, now=done == settings.epochs)
         if progress is not None:
             jax.block_until_ready(losses)
-            progress(done, recipe.epochs)
+            progress(done, settings.epochs)
     if not np.isfinite(fit.best_loss).all():
         raise InputError("The training diverged: use a smaller learning rate.")
     record = {
-        **recipe.as_dict(),
+        # At most the examples there are.
         "batch": batch,
         # Numbers, or lists of them: one for each member.
         "best_epoch": (np.asarray(fit.best_epoch) + 1).tolist(),

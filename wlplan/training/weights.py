@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,8 +13,8 @@ from wlplan.dataset.store import is_new, read_attributes
 from wlplan.errors import InputError
 from wlplan.io.provenance import versions
 from wlplan.models.storage import load_model, read_description
-from wlplan.training.performance import train_psi_high, train_psi_low
-from wlplan.training.pile_state import train_phi
+from wlplan.training.settings import PhiSettings, PsiHighSettings, PsiLowSettings, Settings
+from wlplan.training.trainer import train
 
 
 class _Part(NamedTuple):
@@ -35,19 +36,14 @@ _DATA = (
     _Part("-slow", "slow", 32_400),
 )
 
-# Of each model its training, and how. With so many cycles no unit has to be dropped, and ψ_high is
-# as good with three layers of 256 units as of 512.
-_TRAININGS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
-    "psi_low": (
-        train_psi_low,
-        {"members": 5, "hidden": (128,) * 3, "dropout": 0.0, "epochs": 40, "batch": 256},
-    ),
-    "psi_high": (
-        train_psi_high,
-        {"members": 5, "hidden": (256,) * 3, "dropout": 0.0, "epochs": 60, "batch": 256},
-    ),
-    "phi": (train_phi, {"hidden": (512,) * 3, "dropout": 0.0, "epochs": 40, "batch": 256}),
-}
+# With so many cycles no unit has to be dropped, and ψ_high is as good with three layers of 256
+# units as of 512.
+SHIPPED: tuple[Settings, ...] = (
+    PsiLowSettings(members=5, hidden=(128,) * 3, dropout=0.0, epochs=40, batch=256),
+    PsiHighSettings(members=5, hidden=(256,) * 3, dropout=0.0, epochs=60, batch=256),
+    PhiSettings(hidden=(512,) * 3, dropout=0.0, epochs=40, batch=256),
+)
+"""How the models that ship are trained, apart from the seed."""
 
 
 def train_all(
@@ -78,54 +74,48 @@ def train_all(
         InputError: As for `collect` and the trainings.
     """
 
-    def told(name: str) -> Callable[[int, int], None] | None:
+    def progress_of(name: str) -> Callable[[int, int], None] | None:
         return None if progress is None else lambda done, total: progress(name, done, total)
 
     data = Path(data)
     datasets = []
     for number, part in enumerate(_DATA):
         place = data.with_name(f"{data.stem}{part.suffix}{data.suffix}")
-        tell = told(f"cycles, {place.name}")
+        advance = progress_of(f"cycles, {place.name}")
         if is_new(place):
             collect(
                 place,
                 cycles=part.cycles,
                 seed=seed + number,
                 protocol=part.protocol,
-                progress=tell,
+                progress=advance,
             )
         elif (begun := read_attributes(place)).get("cycles_done") != begun.get("cycles"):
             same = {name: begun[name] for name in ("cycles", "seed", "protocol")}
-            collect(place, **same, progress=tell)
+            collect(place, **same, progress=advance)
         datasets.append(open_dataset(place))
     marks = [fingerprint(dataset) for dataset in datasets]
     reports = {}
-    for kind, (trainer, settings) in _TRAININGS.items():
-        place = Path(out) / kind
-        wanted = {**settings, "seed": seed}
-        if epochs is not None:
-            wanted["epochs"] = epochs
-        if not _is_done(place, kind, marks, wanted):
-            trainer(datasets, out=place, progress=told(kind), **wanted)
-        reports[kind] = read_description(place, kind)["held_out"]
+    for settings in SHIPPED:
+        wanted = dataclasses.replace(
+            settings, seed=seed, epochs=settings.epochs if epochs is None else epochs
+        )
+        place = Path(out) / wanted.kind
+        if not _is_done(place, marks, wanted):
+            train(wanted, datasets, out=place, progress=progress_of(wanted.kind))
+        reports[wanted.kind] = read_description(place, wanted.kind)["held_out"]
     return reports
 
 
-def _is_done(place: Path, kind: str, marks: list[str], wanted: Mapping[str, Any]) -> bool:
+def _is_done(place: Path, marks: list[str], settings: Settings) -> bool:
     """Whether a training with these settings has ended before."""
     try:
-        load_model(place, kind)
-        description = read_description(place, kind)
+        load_model(place, settings.kind)
+        description = read_description(place, settings.kind)
     except InputError:
         return False
-    made = {**description["training"], **description["architecture"]}
-    same = all(made.get(name) == _as_json(value) for name, value in wanted.items())
     return (
-        same
+        description["training"].get("settings") == settings.as_dict()
         and description["dataset"].get("fingerprints") == marks
         and description["versions"] == versions()
     )
-
-
-def _as_json(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value

@@ -12,11 +12,9 @@ from jaxtyping import Array
 
 from wlplan.constants import CELL_SIZE, KG_PER_TONNE
 from wlplan.dataset import Dataset
-from wlplan.models.ensemble import Ensemble, members_of
-from wlplan.models.height_change import HeightChangeModel
+from wlplan.models.ensemble import Ensemble
 from wlplan.models.performance import PerformanceModel
-from wlplan.models.performance_high import HighPerformanceModel
-from wlplan.models.pile_state import PileStateModel
+from wlplan.models.pile_state import PileStatePredictor
 from wlplan.site.soil import GRAVEL
 from wlplan.studies.bench.timing import Timing, compiled, timed
 from wlplan.terrain.heightmap import STATE_DISPLACEMENT
@@ -32,7 +30,7 @@ class InferenceTime:
     """Wall-clock time of calls of one compiled function [s]."""
 
     inputs: int  # of one call
-    deviation: bool  # whether an ensemble tells how far it may be off, too
+    deviation: bool  # whether an ensemble predicts the deviation of its error, too
     compile: float  # tracing and compiling
     call: Timing
 
@@ -52,60 +50,58 @@ class InferenceTime:
         }
 
 
-def inference_times(
-    model: PerformanceModel | HighPerformanceModel | Ensemble | HeightChangeModel | PileStateModel,
-    dataset: Dataset,
-    *,
-    blend: bool = True,
-) -> list[InferenceTime]:
-    """Times a predictor on one input, and on 150 in one call; an ensemble also with its deviation.
+def performance_times(model: PerformanceModel | Ensemble, dataset: Dataset) -> list[InferenceTime]:
+    """Times ψ on one input, and on 150 in one call; an ensemble also with its deviation.
 
-    The weights are compiled in, as in a planner: to hand them over takes a small model as long
-    again.
+    An input is what a data set stores of the local heightmap, see `PerformanceModel.view`. The
+    weights are compiled in, as in a planner: to hand them over takes a small model as long again.
 
     Args:
-        model: Predictor.
+        model: Performance predictor.
         dataset: Cycles to take the inputs from; where there are fewer than 150, some come again.
-        blend: Whether the paper's pile state predictor blends with the map before along the edges.
     """
-    which = jnp.arange(BATCH) % len(dataset)
-    times = []
-    for deviation in (False, True) if isinstance(model, Ensemble) else (False,):
-        function, inputs = _inputs(model, dataset, blend, deviation)
-        batch = tuple(jnp.asarray(values)[which] for values in inputs)
-        singles = [tuple(values[n] for values in batch) for n in range(BATCH)]
-        one, first = compiled(function, *singles[0])
-        many, second = compiled(jax.vmap(function), *batch)
-        (single,) = timed([one], singles, seconds=_SECONDS, least=1)
-        (together,) = timed([many], [batch], seconds=_SECONDS, least=_LEAST)
-        times.append(InferenceTime(1, deviation, first, single.timing))
-        times.append(InferenceTime(BATCH, deviation, second, together.timing))
+    table = (getattr(dataset, model.view_variable), dataset.action)
+    # Not the methods themselves: JAX hashes what it compiles, and weights have no hash.
+    times = _times(lambda view, action: model.of_view(view, action), table)
+    if isinstance(model, Ensemble):
+        ensemble = model
+        times += _times(
+            lambda view, action: ensemble.of_view_with_deviation(view, action),
+            table,
+            deviation=True,
+        )
     return times
 
 
-def _inputs(
-    model: Any, dataset: Dataset, blend: bool, deviation: bool
-) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-    """The predictor as a function of arrays, and a table of each of them."""
-    seen_by = members_of(model)
-    predict = model.with_deviation if deviation else model
-    if isinstance(seen_by, PerformanceModel):
-        return (
-            lambda characteristics, action: predict(characteristics, action),
-            (dataset.characteristics, dataset.action),
-        )
-    if isinstance(seen_by, HighPerformanceModel):
-        return (
-            lambda height, action: predict(LocalHeightmap(height, CELL_SIZE, 0.0), action),
-            (dataset.h36, dataset.action),
-        )
+def pile_state_times(model: PileStatePredictor, dataset: Dataset) -> list[InferenceTime]:
+    """Times φ on one input, and on 150 in one call.
 
-    def state(height: Array, action: Array, volume: Array) -> Array:
+    Args:
+        model: Pile state predictor; its weights are compiled in.
+        dataset: Cycles to take the inputs from; where there are fewer than 150, some come again.
+    """
+
+    def change(height: Array, action: Array, volume: Array) -> Array:
         local = LocalHeightmap(height, CELL_SIZE, STATE_DISPLACEMENT)
-        if isinstance(model, PileStateModel):
-            return model(local, action, blend=blend)
         return model(local, action, volume, jnp.full_like(height, height.min()))
 
     # At the density of gravel: the time does not depend on the volume.
-    volume = dataset.mass * (KG_PER_TONNE / GRAVEL.density)
-    return state, (dataset.h52, dataset.action, volume.astype(dataset.mass.dtype))
+    volume = (dataset.mass * (KG_PER_TONNE / GRAVEL.density)).astype(dataset.mass.dtype)
+    return _times(change, (dataset.h52, dataset.action, volume))
+
+
+def _times(
+    function: Callable[..., Any], table: tuple[Any, ...], *, deviation: bool = False
+) -> list[InferenceTime]:
+    """Times of one input and of a batch of a function of rows of a table."""
+    which = jnp.arange(BATCH) % len(table[0])
+    batch = tuple(jnp.asarray(values)[which] for values in table)
+    singles = [tuple(values[n] for values in batch) for n in range(BATCH)]
+    one, first = compiled(function, *singles[0])
+    many, second = compiled(jax.vmap(function), *batch)
+    (single,) = timed([one], singles, seconds=_SECONDS, least=1)
+    (together,) = timed([many], [batch], seconds=_SECONDS, least=_LEAST)
+    return [
+        InferenceTime(1, deviation, first, single.timing),
+        InferenceTime(BATCH, deviation, second, together.timing),
+    ]

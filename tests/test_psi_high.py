@@ -9,21 +9,17 @@ from trainings import check_that_a_killed_one_ends_alike
 
 from wlplan.dataset import VARIABLES, Dataset
 from wlplan.errors import InputError
-from wlplan.models.layers import ACTIVATIONS, max_pool, patches, resize
+from wlplan.models.architecture import ACTIVATIONS, ENCODERS
+from wlplan.models.layers import max_pool, patches, resize
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.performance_high import (
-    ENCODERS,
-    HighPerformanceModel,
-    PrincipalComponents,
-    PsiHigh,
-)
+from wlplan.models.psi_high import HighPerformanceModel, PrincipalComponents, PsiHigh
 from wlplan.models.storage import load_model, read_description
 from wlplan.site.soil import GRAVEL
 from wlplan.studies.diggability import edge_poses
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import toe_contour
-from wlplan.training import train_psi_high
+from wlplan.training import PsiHighSettings, train
 from wlplan.types import LocalHeightmap, action_from
 from wlplan.worlds.library import load_world
 
@@ -40,8 +36,13 @@ def model_of(encoder="principal", activation="swish", seed=0):
     inputs, outputs = (jnp.asarray(random.uniform(size=(8, n)), jnp.float32) for n in (8, 3))
     network.fit_scales(maps, inputs, outputs)
     graph, params = nnx.split(network)
-    ranges = [np.array([[-0.2], [2.7]], np.float32), np.stack([LOW, HIGH]), OUT]
-    return HighPerformanceModel(params, *(Normaliser.of(r) for r in ranges), graph)
+    ranges = {
+        "maps": np.array([[-0.2], [2.7]], np.float32),
+        "inputs": np.stack([LOW, HIGH]),
+        "outputs": OUT,
+    }
+    normalisers = {name: Normaliser.of(rows) for name, rows in ranges.items()}
+    return HighPerformanceModel(params=params, graph=graph, **normalisers)
 
 
 def surface(seed=0, slope=0.6):
@@ -195,7 +196,7 @@ SETTINGS = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
 
 def test_training_reads_the_map_and_a_model_comes_back_bit_by_bit(tmp_path):
     data = cycles()
-    model, report = train_psi_high(data, out=tmp_path / "m", epochs=20, **SETTINGS)
+    model, report = train(PsiHighSettings(epochs=20, **SETTINGS), data, out=tmp_path / "m")
     # Without the map nothing is known: the mean would be 11 % off.
     assert report.every.mean_relative["mass"] < 0.06
     loaded = load_model(tmp_path / "m", "psi_high")
@@ -217,7 +218,5 @@ def test_training_reads_the_map_and_a_model_comes_back_bit_by_bit(tmp_path):
 
 @pytest.mark.parametrize("encoder", ENCODERS)
 def test_a_killed_training_ends_with_the_same_weights(encoder, tmp_path, monkeypatch):
-    settings = {**SETTINGS, "encoder": encoder, "dropout": 0.1, "epochs": 4}
-    check_that_a_killed_one_ends_alike(
-        train_psi_high, cycles(rollouts=12), tmp_path, monkeypatch, settings, {"seed": 1}
-    )
+    settings = PsiHighSettings(**(SETTINGS | {"encoder": encoder, "dropout": 0.1, "epochs": 4}))
+    check_that_a_killed_one_ends_alike(cycles(rollouts=12), tmp_path, monkeypatch, settings, seed=1)

@@ -9,7 +9,7 @@ not reach stays as it is, and a projection makes exactly the predicted mass leav
 
 from __future__ import annotations
 
-from typing import Any, no_type_check
+from typing import Any, ClassVar, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -17,14 +17,14 @@ from flax import nnx, struct
 from jaxtyping import Array, Float
 
 from wlplan.constants import CELL_SIZE
+from wlplan.models.grid import check_state_map
 from wlplan.models.layers import Mlp, Standardiser, principal_components
-from wlplan.models.pile_state import check_cells
 from wlplan.terrain.heightmap import STATE_CELLS, take
 from wlplan.types import LocalHeightmap
 
 # Components of the maps and of the changes that are kept. Over held-out cycles of our simulator
-# 128 components leave 0.08 m³ of a change of 1.8 m³ unexplained; with 64 and 192 in place of 48 and
-# 128, and a third hidden layer, the predictor errs by 0.30 m³ in place of 0.33.
+# 128 components leave 0.08 m³ of a change of 1.8 m³ unexplained; with 64 and 192 instead of 48 and
+# 128, and a third hidden layer, the predictor errs by 0.30 m³ instead of 0.33.
 _OF_MAP, _OF_CHANGE = 64, 192
 # Least spread of a component of the map: its root mean square over the map [m].
 _LEAST_SPREAD = 0.05
@@ -65,7 +65,8 @@ class HeightChange(nnx.Module):
 
     Args:
         hidden: Units of each hidden layer.
-        activation: Name of the activation function, one of `wlplan.models.layers.ACTIVATIONS`.
+        activation: Name of the activation function, one of
+            `wlplan.models.architecture.ACTIVATIONS`.
         dropout: Part of the hidden units that is dropped in training.
         rngs: Random streams of the initial weights.
     """
@@ -86,7 +87,6 @@ class HeightChange(nnx.Module):
             hidden,
             activation=activation,
             dropout=dropout,
-            standardised=False,
             rngs=rngs,
         )
 
@@ -132,6 +132,8 @@ class HeightChange(nnx.Module):
 class HeightChangeModel(struct.PyTreeNode):
     """A trained `HeightChange`. A pytree: weights and components are leaves."""
 
+    conserves_volume: ClassVar[bool] = True
+
     params: nnx.State
     graph: nnx.GraphDef[Any] = struct.field(pytree_node=False)
 
@@ -147,13 +149,13 @@ class HeightChangeModel(struct.PyTreeNode):
         Args:
             local: Local heightmap of 52 × 52 cells.
             action: Parameters of the bucket-filling controller.
-            volume: What leaves the pile [m³].
+            volume: Volume that leaves the pile [m³].
             ground: Floor under the pile over the reference of the local heightmap [m].
 
         Raises:
-            InputError: If the map has another number of cells.
+            InputError: If the map has another number of cells, or cells of another size.
         """
-        check_cells(local)
+        check_state_map(local)
         network = nnx.merge(self.graph, self.params)
         known = jnp.concatenate([action, volume[None]])
         change = network.change.maps(network(local.height, known))

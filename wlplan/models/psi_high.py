@@ -7,17 +7,19 @@ detail as a few thousand cycles can teach.
 
 from __future__ import annotations
 
-from typing import Any, no_type_check
+from typing import ClassVar, no_type_check
 
 import jax.numpy as jnp
-from flax import nnx, struct
+from flax import nnx
 from jaxtyping import Array, Float
 
+from wlplan.constants import CELL_SIZE
 from wlplan.errors import InputError
+from wlplan.models.architecture import ENCODERS
+from wlplan.models.grid import check_performance_map
 from wlplan.models.layers import (
-    ACTIVATIONS,
-    Mlp,
-    check_activation,
+    StandardisedMlp,
+    activation_named,
     max_pool,
     patches,
     principal_components,
@@ -25,13 +27,10 @@ from wlplan.models.layers import (
     soft_clamp,
 )
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.performance import INPUTS, OUTPUTS, bounded_performance, performance_and_variance
+from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel
 from wlplan.terrain.characteristics import as_vector, characteristics
-from wlplan.terrain.heightmap import PERFORMANCE_CELLS
-from wlplan.types import LocalHeightmap, Performance
-
-ENCODERS = ("convolutional", "principal")
-"""What tells ψ_high about the map: the paper's encoder, and ours."""
+from wlplan.terrain.heightmap import PERFORMANCE_CELLS, PERFORMANCE_DISPLACEMENT
+from wlplan.types import LocalHeightmap
 
 # Paper, section 4.4: the map is brought to 32 × 32 cells; three convolutions of ten filters, each
 # with a 2 × 2 pooling; a code of 32 numbers.
@@ -67,7 +66,7 @@ class ConvolutionalEncoder(nnx.Module):
     """The paper's encoder: three convolutions with batch normalisation and pooling, one linear."""
 
     def __init__(self, *, activation: str, rngs: nnx.Rngs):
-        check_activation(activation)
+        activation_named(activation)
         channels = (1, *[_FILTERS] * (_STAGES - 1))
         self.filters = nnx.List(nnx.Linear(9 * n, _FILTERS, rngs=rngs) for n in channels)
         self.norms = nnx.List(nnx.BatchNorm(_FILTERS, axis=0, rngs=rngs) for _ in channels)
@@ -85,7 +84,7 @@ class ConvolutionalEncoder(nnx.Module):
             near = patches(x)
             x = filters(near.reshape(len(near), -1).T).T
             x = norm(x, use_running_average=not training).reshape(_FILTERS, *near.shape[1:])
-            x = max_pool(ACTIVATIONS[self.activation](x))
+            x = max_pool(activation_named(self.activation)(x))
         return self.output(x.reshape(-1, x.shape[-1]).T).reshape(*batch, _CODE)
 
 
@@ -96,9 +95,11 @@ class PsiHigh(nnx.Module):
         hidden: Units of each hidden layer behind the encoder.
         encoder: "convolutional" (the paper's) or "principal" (ours); the latter also sees the four
             characteristics.
-        activation: Name of the activation function, one of `wlplan.models.layers.ACTIVATIONS`.
+        activation: Name of the activation function, one of
+            `wlplan.models.architecture.ACTIVATIONS`.
         dropout: Part of the hidden units that is dropped in training.
-        scattered: Whether it also tells how far it may be off, as members of an ensemble do.
+        scattered: Whether it also predicts the variance of its errors, as members of an ensemble
+            do.
         rngs: Random streams of the initial weights.
 
     Raises:
@@ -125,7 +126,7 @@ class PsiHigh(nnx.Module):
             else PrincipalComponents()
         )
         inputs = _CODE + 4 if convolutional else _COMPONENTS + INPUTS
-        self.head = Mlp(
+        self.head = StandardisedMlp(
             inputs,
             OUTPUTS,
             hidden,
@@ -171,66 +172,39 @@ class PsiHigh(nnx.Module):
 
         The paper's encoder learns the scale of its own code, so there only the outputs are scaled.
         """
-        scale_in, scale_out = self.head.scale_in, self.head.scale_out
-        if scale_in is None or scale_out is None:
-            return
-        scale_out.fit(outputs)
+        self.head.scale_out.fit(outputs)
         if isinstance(self.encoder, PrincipalComponents):
             self.encoder.fit(maps)
             least = jnp.where(jnp.arange(_COMPONENTS + INPUTS) < _COMPONENTS, _LEAST_SPREAD, 1e-3)
-            scale_in.fit(self.features(maps, inputs), least=least)
+            self.head.scale_in.fit(self.features(maps, inputs), least=least)
 
 
 @no_type_check
-class HighPerformanceModel(struct.PyTreeNode):
-    """A trained ψ_high. A pytree: weights, running norms and normalisers are leaves.
+class HighPerformanceModel(PerformanceModel):
+    """A trained ψ_high; its view are the heights [m], 36 × 36. Running norms are leaves too."""
 
-    The weights are float32; with float64 inputs the arithmetic is in float64.
-    """
+    view_variable: ClassVar[str] = "h36"
 
-    params: nnx.State
     maps: Normaliser  # height of a local heightmap [m]
-    inputs: Normaliser  # characteristics [rad, rad, 1/m, 1/m], then action
-    outputs: Normaliser  # mass [tonne], time [s], work [kJ]
-    graph: nnx.GraphDef[Any] = struct.field(pytree_node=False)
 
-    def __call__(self, local: LocalHeightmap, action: Float[Array, "4"]) -> Performance:
-        """Performance of one loading; deterministic and differentiable.
-
-        Heights, characteristics and action are held near the range of the training data, see
-        `soft_clamp`, outputs to what is possible, see `bounded_performance`.
-
-        Args:
-            local: Local heightmap of 36 × 36 cells.
-            action: Parameters of the bucket-filling controller.
+    def view(self, local: LocalHeightmap) -> Float[Array, "36 36"]:
+        """The heights of a local heightmap of 36 × 36 cells [m].
 
         Raises:
-            InputError: If the map has another number of cells.
+            InputError: If the map has another number of cells, or cells of another size.
         """
-        network = nnx.merge(self.graph, self.params)
-        return bounded_performance(network(*self._normalised(local, action)), self.outputs)
+        check_performance_map(local)
+        return local.height
 
-    def with_variance(
-        self, local: LocalHeightmap, action: Float[Array, "4"]
-    ) -> tuple[Performance, Performance]:
-        """The performance, and the variance of what it may be off [tonne², s², kJ²].
-
-        Raises:
-            InputError: If the map has another number of cells, or the network was not trained to
-                tell, see `Mlp.outputs_and_variances`.
-        """
-        network = nnx.merge(self.graph, self.params)
-        features = network.features(*self._normalised(local, action))
-        return performance_and_variance(network.head, features, self.outputs)
-
-    def _normalised(self, local: LocalHeightmap, action: Array) -> tuple[Array, Array]:
-        if local.height.shape != (PERFORMANCE_CELLS, PERFORMANCE_CELLS):
-            raise InputError(
-                f"The local heightmap has {local.height.shape} cells; ψ_high was trained on "
-                f"{PERFORMANCE_CELLS} a side: sample it with cells={PERFORMANCE_CELLS}."
-            )
+    def head_and_features(
+        self, view: Float[Array, "36 36"], action: Float[Array, "4"]
+    ) -> tuple[StandardisedMlp, Float[Array, " k"]]:
+        """The perceptron behind the encoder, and what the encoder passes on to it."""
+        local = LocalHeightmap(view, CELL_SIZE, PERFORMANCE_DISPLACEMENT)
         raw = jnp.concatenate([as_vector(characteristics(local)), jnp.asarray(action)])
-        return (
-            soft_clamp((local.height - self.maps.low[0]) / self.maps.span[0]),
+        network = nnx.merge(self.graph, self.params)
+        features = network.features(
+            soft_clamp((view - self.maps.low[0]) / self.maps.span[0]),
             soft_clamp(self.inputs.normalise(raw)),
         )
+        return network.head, features

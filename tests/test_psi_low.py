@@ -9,9 +9,13 @@ import pytest
 from flax import nnx
 
 from wlplan.errors import InputError
-from wlplan.models.layers import ACTIVATIONS, soft_clamp
+from wlplan.models.architecture import ACTIVATIONS
+from wlplan.models.layers import soft_clamp
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel, PsiLow
+from wlplan.models.performance import INPUTS, OUTPUTS
+from wlplan.models.psi_low import LowPerformanceModel, PsiLow
+from wlplan.terrain.characteristics import as_vector, characteristics
+from wlplan.types import LocalHeightmap
 
 LOW = np.array([0.2, 0.0, -0.3, -0.2, 0.0, 0.0, 0.0, 0.0], np.float32)
 HIGH = np.array([0.6, 1.5, 0.3, 0.4, 0.7, 5.0, 0.7, 5.0], np.float32)
@@ -24,7 +28,7 @@ def model_of(seed=0, hidden=(32, 32), **settings):
     # Large output weights, so that the untrained network asks for negative loads too.
     params["output"]["kernel"][...] = 20.0 * params["output"]["kernel"][...]
     inputs, outputs = (Normaliser.of(np.stack(rows)) for rows in ((LOW, HIGH), (OUT_LOW, OUT_HIGH)))
-    return PerformanceModel(params, inputs, outputs, graph)
+    return LowPerformanceModel(params, inputs, outputs, graph)
 
 
 def inputs_of(count, seed=0, wild=0.0):
@@ -38,7 +42,7 @@ def as_rows(performance):
 
 
 def total(model, characteristics, action):
-    p = model(characteristics, action)
+    p = model.of_view(characteristics, action)
     return p.mass / 3.0 + p.time / 10.0 + p.work / 400.0
 
 
@@ -79,7 +83,7 @@ def test_an_architecture_without_sense_is_refused(settings):
 def test_a_batch_equals_its_members(model):
     characteristics, action = inputs_of(7)
     batch = jax.jit(jax.vmap(model))(characteristics, action)
-    single = [model(c, a) for c, a in zip(characteristics, action, strict=True)]
+    single = [model.of_view(c, a) for c, a in zip(characteristics, action, strict=True)]
     np.testing.assert_allclose(
         as_rows(batch), np.stack([as_rows(p) for p in single]), rtol=2e-5, atol=1e-4
     )
@@ -87,18 +91,18 @@ def test_a_batch_equals_its_members(model):
 
 def test_a_model_is_a_pytree_that_passes_through_jit(model):
     characteristics, action = inputs_of(1)
-    call = jax.jit(lambda m, c, a: m(c, a))
+    call = jax.jit(lambda m, c, a: m.of_view(c, a))
     first = call(model, characteristics[0], action[0])
     call(model_of(seed=1), characteristics[0], action[0])
     assert call._cache_size() == 1  # other weights are no other program
     np.testing.assert_allclose(
-        as_rows(first), as_rows(model(characteristics[0], action[0])), rtol=1e-5
+        as_rows(first), as_rows(model.of_view(characteristics[0], action[0])), rtol=1e-5
     )
 
 
 @pytest.mark.parametrize("wild", [0.0, 1.0, 100.0, 1e6])
 def test_outcomes_are_positive_and_finite(model, wild):
-    rows = np.asarray(as_rows(jax.vmap(model)(*inputs_of(300, wild=wild))))
+    rows = np.asarray(as_rows(jax.vmap(model.of_view)(*inputs_of(300, wild=wild))))
     assert np.all(np.isfinite(rows))
     assert np.all(rows >= 0.001 * (OUT_HIGH - OUT_LOW))
 
@@ -106,7 +110,7 @@ def test_outcomes_are_positive_and_finite(model, wild):
 def test_far_out_the_network_promises_nothing_new(model):
     sides = np.random.default_rng(0).choice([-1.0, 1.0], (50, INPUTS))
     far, farther = ((LOW + out * (HIGH - LOW) * sides).astype(np.float32) for out in (1e2, 1e6))
-    rows = [as_rows(jax.vmap(model)(x[:, :4], x[:, 4:])) for x in (far, farther)]
+    rows = [as_rows(jax.vmap(model.of_view)(x[:, :4], x[:, 4:])) for x in (far, farther)]
     np.testing.assert_allclose(*rows, rtol=1e-5)
 
 
@@ -123,7 +127,7 @@ def test_the_floor_leaves_the_range_of_the_data_alone():
     params["output"]["kernel"][...] = 0.0 * params["output"]["kernel"][...]
     params["output"]["bias"][...] = jnp.array([0.5, 0.0, 1.0])
     flat = model_of().replace(params=params)
-    rows = as_rows(flat(*(part[0] for part in inputs_of(1))))
+    rows = as_rows(flat.of_view(*(part[0] for part in inputs_of(1))))
     np.testing.assert_allclose(rows, [2.55, 6.5, 1300.0], rtol=1e-3)
 
 
@@ -156,6 +160,20 @@ def test_gradients_equal_finite_differences_in_float64(model):
             step = 1e-6
             want = [(f(x + step * e) - f(x - step * e)) / (2 * step) for e in np.eye(INPUTS)]
             np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-7)
+
+
+def test_a_local_heightmap_is_seen_by_its_characteristics(model):
+    rise = np.broadcast_to(0.05 * np.arange(36.0)[:, None], (36, 36)).astype(np.float32)
+    local = LocalHeightmap(jnp.asarray(rise), 0.1, 0.0)
+    action = inputs_of(1)[1][0]
+    want = model.of_view(as_vector(characteristics(local)), action)
+    np.testing.assert_array_equal(as_rows(model(local, action)), as_rows(want))
+    for wrong in (
+        LocalHeightmap(jnp.zeros((52, 52)), 0.1, 0.0),
+        LocalHeightmap(jnp.zeros((36, 36)), 0.2, 0.0),
+    ):
+        with pytest.raises(InputError, match="cells=36"):
+            model(wrong, action)
 
 
 def test_the_soft_clamp_is_the_identity_inside_and_smooth_at_the_border():

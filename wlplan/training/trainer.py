@@ -1,7 +1,11 @@
-"""What every training does: split the data, fit and resume, evaluate, save."""
+"""What every training does: split the data, fit and resume, evaluate, save.
+
+`train` is the one entry to all of them.
+"""
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,8 +17,9 @@ from flax import nnx
 from wlplan.dataset import Dataset, fingerprint, join, probes_of, split
 from wlplan.errors import InputError
 from wlplan.io.provenance import versions
-from wlplan.models.storage import Model, architecture, check_target, kind_of_network, save_model
-from wlplan.training.fitting import Loss, Recipe, SavedState, fitted
+from wlplan.models.storage import Model, check_target, save_model
+from wlplan.training.fitting import OPTIMISER, Loss, SavedState, fit_network
+from wlplan.training.settings import Settings
 from wlplan.types import PyTree
 
 # Training, validation and test. Paper, section 6.4: 10,718 cycles, 1,072 of them for the test,
@@ -34,7 +39,44 @@ AnyModel = TypeVar("AnyModel", bound=Model)
 AnyReport = TypeVar("AnyReport", bound=Report)
 
 
-class Session:
+Progress = Callable[[int, int], None]
+"""Called with the number of epochs done and in all."""
+
+
+def train(
+    settings: Settings,
+    dataset: Dataset | Sequence[Dataset],
+    *,
+    out: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+) -> tuple[Any, Report]:
+    """Trains a model on a data set and saves it.
+
+    The data set is split by rollout, alike for all seeds, so that errors can be compared. Of all
+    epochs the weights with the least loss on the validation part are kept; the report is on the
+    test part, which plays no role in training. Killed, the same call goes on where it was and ends
+    with the same weights.
+
+    Args:
+        settings: What is trained, and how: `PsiLowSettings`, `PsiHighSettings`, `PhiSettings` or
+            `PhiVaeSettings`.
+        dataset: Loading cycles, of one or several data sets, each split by itself; those that are
+            not valid are left out.
+        out: Directory to save to; an older model there is replaced. None: nothing is saved.
+        progress: Called with the number of epochs done and in all.
+
+    Returns:
+        The model, of the kind of the settings, and its errors on the test part.
+
+    Raises:
+        InputError: If the data set is too small or not finite, if training diverges, or if the
+            model cannot be saved.
+    """
+    training: Any = importlib.import_module(f"{__package__}.{settings.kind}")
+    return training.train(settings, dataset, out=out, progress=progress)
+
+
+class Trainer:
     """A training from its data set to the saved model.
 
     The data set is split by rollout, without the cycles that are not valid. Killed, a training that
@@ -43,7 +85,7 @@ class Session:
     Args:
         dataset: Loading cycles, of one or several data sets; each is split by itself.
         out: Directory to save to; an older model there is replaced. None: nothing is saved.
-        recipe: How long and how fast.
+        settings: How it is trained.
         tables: Arrays of a part of the data that the training looks at.
 
     Attributes:
@@ -61,7 +103,7 @@ class Session:
         self,
         dataset: Dataset | Sequence[Dataset],
         out: str | os.PathLike[str] | None,
-        recipe: Recipe,
+        settings: Settings,
         tables: Callable[[Dataset], Mapping[str, np.ndarray]],
     ):
         self._out = None if out is None else Path(out)
@@ -89,7 +131,7 @@ class Session:
             {name: np.concatenate([table[name] for table in part]) for name in part[0]}
             for part in zip(*rows, strict=True)
         ]
-        self._recipe = recipe
+        self._settings = settings
         self._data = {
             "fingerprints": [fingerprint(each) for each in datasets],
             # Of the first; the others are of the same soil and machine.
@@ -103,40 +145,37 @@ class Session:
 
     def fit(
         self,
-        networks: nnx.Module | list[nnx.Module],
+        networks: Sequence[nnx.Module],
         loss: Loss,
         examples: list[PyTree],
         *,
         stage: str = "",
-        whole: nnx.Module | None = None,
         augment: Callable[..., PyTree] | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Progress | None = None,
     ) -> Any:
         """Fits a network, or the members of an ensemble, to examples.
 
         Args:
-            networks: Network to start from, or those of all members.
+            networks: Network to start from, or those of all members of an ensemble.
             loss: Loss to reduce.
             examples: Examples of the training and of the validation part.
             stage: Name of a part of the training, where it has several.
-            whole: Network that the one to fit is a part of, where it is one.
             augment: Changes the examples of a step at random.
             progress: Called with the number of epochs done and in all.
 
         Returns:
-            The state with the least validation loss; of members stacked.
+            The state with the least validation loss; of several networks stacked.
 
         Raises:
             InputError: If the training diverges.
         """
-        network = networks[0] if isinstance(networks, list) else networks
-        state = self._state_of(whole or network, stage)
-        best, self._records[stage] = fitted(
+        state = self._state_of(stage)
+        best, self._records[stage] = fit_network(
             networks,
             loss,
             examples[0],
             examples[1],
-            self._recipe,
+            self._settings,
             augment=augment,
             state=state,
             progress=progress,
@@ -155,6 +194,8 @@ class Session:
         if self._out is not None:
             records = self._records.get("", self._records)
             training = {
+                "settings": self._settings.as_dict(),
+                "optimiser": OPTIMISER,
                 **records,
                 "fractions": _FRACTIONS,
                 "cycles": self.cycles,
@@ -168,16 +209,16 @@ class Session:
                 state.remove()
         return report
 
-    def _state_of(self, network: nnx.Module, stage: str) -> SavedState | None:
+    def _state_of(self, stage: str) -> SavedState | None:
         """Where the fit of a stage is kept, under everything that its result follows from."""
         if self._out is None:
             return None
         identity = {
             "dataset": self._data["fingerprints"],
             "fractions": _FRACTIONS,
-            "recipe": self._recipe.as_dict(),
-            "kind": kind_of_network(network),
-            "architecture": architecture(network),
+            "kind": self._settings.kind,
+            "settings": self._settings.as_dict(),
+            "optimiser": OPTIMISER,
             "stage": stage,
             "versions": versions(),
         }
