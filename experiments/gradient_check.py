@@ -10,9 +10,7 @@ from typing import Any
 import wlplan
 from experiments.record import main
 from wlplan.io import write_bytes_atomic
-from wlplan.planning.job import Job
-from wlplan.planning.objective import OBJECTIVES
-from wlplan.planning.transport import default_receiver
+from wlplan.planning.job import make_job
 from wlplan.report.figures import png_bytes
 from wlplan.studies.gradcheck import COMPONENTS, TOLERANCE, check_gradient, random_plan
 
@@ -23,7 +21,7 @@ def run(preset: str) -> dict[str, Any]:
     """Reverse mode and central differences over every pose and action component."""
     loads = 1 if preset == "smoke" else LOADS
     pile = wlplan.relax(wlplan.seed_pile(KIND, slope=math.radians(SLOPE_DEGREES), seed=SEED))
-    job = Job(wlplan.load_world("low"), pile, default_receiver(pile), OBJECTIVES["efficiency"])
+    job = make_job(wlplan.load_world("low"), pile)
     check = check_gradient(job, random_plan(pile, loads, seed=SEED))
     return {"loads": loads, **check.as_dict()}
 

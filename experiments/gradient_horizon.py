@@ -15,13 +15,11 @@ import wlplan
 from experiments.record import main
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.io import write_bytes_atomic
-from wlplan.planning.job import Decisions, Job, ToeJob, outcomes
-from wlplan.planning.objective import OBJECTIVES
-from wlplan.planning.poses import toe_of
-from wlplan.planning.transport import default_receiver
+from wlplan.planning.job import Decisions, Job, make_job, outcomes, with_toe
 from wlplan.report.figures import png_bytes
-from wlplan.studies.gradcheck import as_table, cost_and_gradient, differentiable
+from wlplan.studies.gradcheck import as_table, cost_and_gradient
 from wlplan.types import LoadingPlan
+from wlplan.worlds.capabilities import with_derivatives
 from wlplan.xla import ParallelMap
 
 # A cone that holds twice what 100 loadings take: a bucket that comes back empty from the last of a
@@ -71,15 +69,9 @@ def _random_plans(name: str, pile: wlplan.Pile, count: int, loads: int) -> tuple
         offset=jnp.asarray(rng.normal(0.0, 0.5, (count, loads)), jnp.float32),
         action=jnp.asarray(rng.normal(size=(count, loads, 4)), jnp.float32),
     )
-    job = ToeJob(
-        world=wlplan.load_world(name),
-        pile=pile,
-        toe=toe_of(wlplan.toe_contour(pile)),
-        receiver=default_receiver(pile),
-        objective=OBJECTIVES["efficiency"],
-    )
+    job = with_toe(make_job(wlplan.load_world(name), pile))
     plan = outcomes(job, decisions).plan
-    return Job(differentiable(job.world), pile, job.receiver, job.objective), plan
+    return job.replace(world=with_derivatives(job.world), toe=None), plan
 
 
 def _row(job: Job, plan: LoadingPlan, loads: int) -> dict[str, Any]:

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from wlplan.planning.planners.search import SearchSettings
 
 import wlplan
 from experiments.record import main
 from wlplan.io import write_bytes_atomic
-from wlplan.planning.plan import PLANNERS, play
-from wlplan.planning.planners.gradient import GradientSettings
+from wlplan.planning.plan import play
+from wlplan.planning.planners import Gradient, Greedy, Nominal
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 
@@ -27,17 +26,17 @@ def run(preset: str) -> dict[str, Any]:
     """Plans with each planner in the low world and plays the plans in the simulator."""
     smoke = preset == "smoke"
     kinds, loads = (KINDS[:1], 2) if smoke else (KINDS, LOADS)
-    search = SearchSettings(actions=6, refine_steps=2, poses_per_metre=0.3, rows=2)
-    quick = {
-        "gradient": GradientSettings(starts=2, iterations=2, candidates=3, search=search),
-        "greedy": search,
-        "nominal": search,
-    }
+    planners: tuple[Nominal | Greedy | Gradient, ...] = (Nominal(), Greedy(), Gradient())
+    if smoke:
+        greedy = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3)
+        nominal = Nominal(actions=6, refine_steps=2, rows=2)
+        few = Gradient(starts=2, iterations=2, candidates=3, greedy=greedy, nominal=nominal)
+        planners = (nominal, greedy, few)
     low, simulator = wlplan.load_world("low"), wlplan.load_world("simulator")
     rows = []
     for kind in kinds:
         pile = wlplan.relax(wlplan.seed_pile(kind, slope=math.radians(SLOPE_DEGREES), seed=SEED))
-        for planner in reversed(PLANNERS):
+        for planner in planners:
             for referee in (None, simulator):
                 start = time.perf_counter()
                 plan = wlplan.plan_loads(
@@ -47,7 +46,6 @@ def run(preset: str) -> dict[str, Any]:
                     planner=planner,
                     seed=SEED,
                     referee=referee,
-                    settings=quick[planner] if smoke else None,
                 )
                 jax.block_until_ready(plan.cost)
                 seconds = time.perf_counter() - start
@@ -55,7 +53,8 @@ def run(preset: str) -> dict[str, Any]:
                 rows.append(
                     {
                         "pile": kind,
-                        "planner": planner + (" + referee" if referee is not None else ""),
+                        "planner": type(planner).__name__.lower()
+                        + (" + referee" if referee is not None else ""),
                         "model": _summary(plan),
                         "simulator": _summary(simulated),
                         "seconds_with_compile": seconds,
@@ -78,8 +77,8 @@ def _summary(outcome: wlplan.PlanResult) -> dict[str, float]:
         "mass": float(performance.mass.sum()),
         "time": float(performance.time.sum()),
         "work": float(performance.work.sum()),
-        "transport_time": float(outcome.transport_time.sum()),
-        "transport_work": float(outcome.transport_work.sum()),
+        "transport_time": float(outcome.transport.time.sum()),
+        "transport_work": float(outcome.transport.work.sum()),
     }
 
 

@@ -33,7 +33,8 @@ from wlplan.report.figures.style import BLUE, FAINT, INK, ORANGE, new_figure, ti
 from wlplan.studies.paper import SEQUENCE, SEQUENCE_LOADS
 from wlplan.training import PhiSettings, PsiHighSettings, PsiLowSettings, Settings
 from wlplan.types import Action, Performance, Pile, Pose, World, action_from
-from wlplan.worlds.library import HighWorld, HybridWorld, LowWorld, load_world
+from wlplan.worlds.learned import LearnedWorld
+from wlplan.worlds.library import load_world
 
 # Another seed than that of the data set: other noise, poses and actions.
 SEED, PILES, LOADS = 1000, 10, 40
@@ -132,11 +133,11 @@ def learned_worlds(
             return trained(models, data, shortened(settings) if smoke else settings)[0]
 
         if "low" not in worlds:
-            worlds["low"] = LowWorld(of(PsiLowSettings()))
+            worlds["low"] = LearnedWorld(of(PsiLowSettings()))
         if "hybrid" not in worlds:
-            worlds["hybrid"] = HybridWorld(of(PsiHighSettings()))
+            worlds["hybrid"] = LearnedWorld(of(PsiHighSettings()))
         if "high" not in worlds:
-            worlds["high"] = HighWorld(of(PsiHighSettings()), of(PhiSettings()))
+            worlds["high"] = LearnedWorld(of(PsiHighSettings()), of(PhiSettings()))
     return {name: worlds[name] for name in WORLDS}, sources
 
 

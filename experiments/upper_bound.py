@@ -15,12 +15,8 @@ import numpy as np
 import wlplan
 from experiments.record import main
 from wlplan.io import write_bytes_atomic
-from wlplan.planning.job import Decisions, ToeJob, contour_length, outcomes
-from wlplan.planning.objective import OBJECTIVES
-from wlplan.planning.planners.gradient import GradientSettings, gradient
-from wlplan.planning.planners.search import SearchSettings, greedy
-from wlplan.planning.poses import toe_of
-from wlplan.planning.transport import default_receiver
+from wlplan.planning.job import Decisions, contour_length, make_job, outcomes, with_toe
+from wlplan.planning.planners import Gradient, Greedy, Nominal
 from wlplan.report.figures import png_bytes
 
 KIND, SLOPE_DEGREES, SEED, LOADS = "conical", 30.0, 1, 10
@@ -30,20 +26,22 @@ def run(preset: str) -> dict[str, Any]:
     """Starts from the greedy plan and improves it by trial in the simulator."""
     smoke = preset == "smoke"
     loads, rounds, batch = (2, 2, 4) if smoke else (LOADS, 45, 16)
-    search = SearchSettings(actions=6, refine_steps=2, poses_per_metre=0.3, rows=2)
+    planner = Gradient()
+    if smoke:
+        planner = Gradient(
+            starts=2,
+            iterations=2,
+            candidates=3,
+            greedy=Greedy(actions=6, refine_steps=2, poses_per_metre=0.3),
+            nominal=Nominal(actions=6, refine_steps=2, rows=2),
+        )
     pile = wlplan.relax(wlplan.seed_pile(KIND, slope=math.radians(SLOPE_DEGREES), seed=SEED))
-    job = ToeJob(
-        world=wlplan.load_world("low"),
-        pile=pile,
-        toe=toe_of(wlplan.toe_contour(pile)),
-        receiver=default_receiver(pile),
-        objective=OBJECTIVES["efficiency"],
-    )
+    job = with_toe(make_job(wlplan.load_world("low"), pile))
     simulated = job.replace(world=wlplan.load_world("simulator"))
-    greedy_plan = greedy(job, loads, seed=SEED, **({"settings": search} if smoke else {}))
-    settings = GradientSettings(starts=2, iterations=2, candidates=3, search=search)
-    plans = gradient(job, loads, seed=SEED, **({"settings": settings} if smoke else {}))
-    greedy_cost = float(outcomes(simulated, greedy_plan).cost[0])
+    plans, greedy_plan = planner.propose(job, loads, seed=SEED)
+    # The limit of the gradient planner is the greedy plan, which is a candidate too.
+    plans = jax.tree.map(lambda all_, one: jnp.concatenate([all_, one[None]]), plans, greedy_plan)
+    greedy_cost = float(outcomes(simulated, plans).cost[-1])
     costs = np.asarray(outcomes(simulated, plans).cost)
     best = jax.tree.map(lambda leaf: leaf[int(costs.argmin())], plans)
     best_cost = float(costs.min())

@@ -16,11 +16,11 @@ import pytest
 from experiments import dem_cycles
 from wlplan import cli, io
 from wlplan.engines.dem import bucket, columns, cycle, grains, loader, packing, process, worker
-from wlplan.engines.dem.world import DiscreteElements, loads, site_remark
+from wlplan.engines.dem.world import DiscreteElements
 from wlplan.engines.limits import BRAKE_TIME, MAX_PENETRATION, STOP_REASONS
 from wlplan.engines.simulator import loader as simulated
 from wlplan.errors import InputError
-from wlplan.planning.plan import plan_loads
+from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.rollout import rollout
 from wlplan.site.machine import WA320
 from wlplan.site.soil import GRAVEL, SAND
@@ -384,6 +384,14 @@ def test_the_floor_under_the_soil_is_taken_off(jobs):
     assert np.allclose(world.view(raised, one.pose), world.view(pile, one.pose), atol=1e-5)
 
 
+def loads(world, pile, plan, note):
+    """A plan load by load."""
+    for n in range(len(plan.pose.x)):
+        pose, action = jax.tree.map(lambda leaf, n=n: leaf[n], (plan.pose, plan.action))
+        pile, performance, record = world.play_load(pile, pose, action, note)
+        yield pile, performance, record
+
+
 def test_it_drives_the_rollout_and_load_by_load_is_the_same(jobs):
     world, pile, plan = DiscreteElements(), wide_pile(), plan_of(3)
     traced = jax.jit(rollout)(world, pile, plan)
@@ -409,7 +417,7 @@ def test_a_derivative_is_refused(jobs):
     world, pile, plan = DiscreteElements(), wide_pile(), plan_of(1)
     with pytest.raises(InputError, match="no derivative"):
         jax.grad(lambda p: rollout(world, pile, p).performance.work.sum())(plan)
-    with pytest.raises(InputError, match="without derivatives"):
+    with pytest.raises(InputError, match="no derivative"):
         plan_loads(world, pile, loads=1, planner="gradient")
 
 
@@ -449,9 +457,28 @@ def test_what_the_engine_does_not_see_is_told(jobs):
 
 
 def test_a_soil_of_which_little_carries_over_is_told():
-    assert site_remark(GRAVEL) is None
-    assert site_remark(dataclasses.replace(GRAVEL, density=1500.0)) is None
-    assert "friction" in site_remark(SAND)
+    def notes(soil):
+        return DiscreteElements(soil=soil).notes()
+
+    (where,) = notes(GRAVEL)
+    assert "kept in" in where
+    assert notes(dataclasses.replace(GRAVEL, density=1500.0)) == [where]
+    assert "friction" in notes(SAND)[0]
+
+
+def test_play_goes_load_by_load_and_hands_on_notes_and_records(jobs):
+    world, pile, plan = DiscreteElements(soil=SAND), wide_pile(), plan_of(2)
+    notes, records = [], []
+    result = play(
+        world, pile, plan, note=notes.append, record=lambda *record: records.append(record)
+    )
+    assert [number for number, _ in records] == [1, 2]
+    assert records[0][1].as_dict()["stop_reason"] in STOP_REASONS
+    assert "friction" in notes[0]
+    *_, (after, _, _) = loads(world, pile, plan, print)
+    assert np.allclose(after.height, result.rollout.pile.height)
+    assert result.solves is None
+    assert float(result.costs.sum()) == pytest.approx(float(result.cost))
 
 
 def test_it_has_a_name():

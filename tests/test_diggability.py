@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from wlplan.errors import InputError
-from wlplan.studies.diggability import PAPER_ACTION, diggability_map, edge_poses
+from wlplan.studies.diggability import PAPER_ACTION, diggability_map
 from wlplan.terrain.heightmap import sample
 from wlplan.terrain.seed_piles import seed_pile
-from wlplan.terrain.toe import ToeContour, toe_contour
+from wlplan.terrain.toe import ToeContour, edge_poses, toe_contour
 from wlplan.types import Action, Performance, Pose
 
 

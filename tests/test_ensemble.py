@@ -15,10 +15,9 @@ from wlplan.dataset import VARIABLES, Dataset
 from wlplan.errors import InputError
 from wlplan.models.ensemble import Ensemble
 from wlplan.models.storage import load_model, read_description
-from wlplan.studies.diggability import edge_poses
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
-from wlplan.terrain.toe import toe_contour
+from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.training import (
     PsiHighSettings,
     PsiLowSettings,
@@ -28,7 +27,7 @@ from wlplan.training import (
     train,
 )
 from wlplan.types import LoadingPlan, LocalHeightmap, action_from
-from wlplan.worlds.library import HybridWorld, LowWorld
+from wlplan.worlds.learned import LearnedWorld
 
 MEMBERS = 5
 LIGHT = {
@@ -205,7 +204,7 @@ def site():
 
 def test_a_world_of_an_ensemble_is_a_world_like_any_other(saved, site):
     pile, poses = site
-    world = LowWorld(saved[1])
+    world = LearnedWorld(saved[1])
     plan = LoadingPlan(poses, action_from(jnp.tile(ACTION, (2, 1))))
     outcome = jax.jit(wlplan.rollout)(world, pile, plan)
     lost = np.asarray(pile.height - outcome.pile.height, np.float64).sum() * pile.cell_size**2
@@ -218,7 +217,7 @@ def test_a_world_predicts_the_deviation_of_its_error(saved, data, site):
     pile, poses = site
     pose = jax.tree.map(lambda leaf: leaf[0], poses)
     high, _ = train(PsiHighSettings(**(LIGHT | {"epochs": 2, "members": 2})), data)
-    for world in (LowWorld(saved[1]), HybridWorld(high)):
+    for world in (LearnedWorld(saved[1]), LearnedWorld(high)):
 
         @jax.jit
         def off(heading, world=world):
@@ -237,7 +236,7 @@ def test_a_world_of_a_single_model_does_not(data, site):
     single, _ = train(PsiLowSettings(**(LIGHT | {"epochs": 1, "members": 1})), data)
     pose = jax.tree.map(lambda leaf: leaf[0], poses)
     with pytest.raises(InputError, match="--members"):
-        LowWorld(single).uncertainty(pile, pose, action_from(ACTION))
+        LearnedWorld(single).uncertainty(pile, pose, action_from(ACTION))
 
 
 def test_without_intervals_a_report_is_as_it_was(data):

@@ -21,14 +21,13 @@ from wlplan.models.phi_vae import (
 from wlplan.models.psi_high import HighPerformanceModel, PsiHigh
 from wlplan.models.storage import load_model
 from wlplan.site.soil import GRAVEL
-from wlplan.studies.diggability import edge_poses
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.automaton.slopes import steepest_slope
 from wlplan.terrain.seed_piles import seed_pile
-from wlplan.terrain.toe import toe_contour
+from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.training import PhiSettings, PhiVaeSettings, evaluate_pile_state, train
 from wlplan.types import LocalHeightmap, action_from
-from wlplan.worlds.library import HighWorld
+from wlplan.worlds.learned import LearnedWorld
 
 ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
 
@@ -278,7 +277,7 @@ def removed(pile, after):
 
 @pytest.mark.parametrize("settle", [True, False])
 def test_the_high_world_removes_the_mass_that_it_reports(psi_high, settle):
-    world = HighWorld(psi_high, model_of(), settle=settle)
+    world = LearnedWorld(psi_high, model_of(), settle=settle)
     pile = relax(seed_pile("conical", slope=np.radians(30.0), height=2.0))
     pose = first_loading(pile)
     after, p = world(pile, pose, action_from(ACTION))
@@ -298,8 +297,8 @@ def test_a_pile_that_holds_less_than_the_load_gives_what_it_has(psi_high):
     pile = seed_pile("conical", slope=np.radians(30.0), height=2.0)
     pose = first_loading(pile)
     thin = pile.replace(height=0.005 * pile.height)
-    _, whole = HighWorld(psi_high, model_of())(pile, pose, action_from(ACTION))
-    after, p = HighWorld(psi_high, model_of())(thin, pose, action_from(ACTION))
+    _, whole = LearnedWorld(psi_high, model_of())(pile, pose, action_from(ACTION))
+    after, p = LearnedWorld(psi_high, model_of())(thin, pose, action_from(ACTION))
     assert 0.0 <= float(p.mass) < 0.3 * float(whole.mass)
     assert removed(thin, after) == pytest.approx(float(p.mass), abs=1e-4)
     assert float(after.height.min()) >= -1e-6
@@ -309,7 +308,7 @@ def test_only_a_map_that_the_automaton_was_asked_for_is_never_too_steep(psi_high
     pile = relax(seed_pile("conical", slope=np.radians(30.0), height=2.0))
     pose = first_loading(pile)
     limit = np.radians(1.0) + GRAVEL.repose_angle + 1e-3
-    settled, _ = HighWorld(psi_high, model_of())(pile, pose, action_from(ACTION))
-    left, _ = HighWorld(psi_high, model_of(), settle=False)(pile, pose, action_from(ACTION))
+    settled, _ = LearnedWorld(psi_high, model_of())(pile, pose, action_from(ACTION))
+    left, _ = LearnedWorld(psi_high, model_of(), settle=False)(pile, pose, action_from(ACTION))
     assert float(steepest_slope(settled)) <= limit < float(steepest_slope(left))
     assert float(settled.height.sum()) == pytest.approx(float(left.height.sum()), rel=1e-6)

@@ -14,9 +14,9 @@ from wlplan.planning.transport import Receiver
 from wlplan.report import figures as plots
 from wlplan.report.figures.digs import _first_crossing, _on_pile, label_places
 from wlplan.report.figures.relief import _relief
-from wlplan.studies.diggability import DiggabilityMap, edge_poses
+from wlplan.studies.diggability import DiggabilityMap
 from wlplan.terrain.seed_piles import seed_pile
-from wlplan.terrain.toe import toe_contour
+from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.types import Action, LoadingPlan, Performance, Pose
 
 

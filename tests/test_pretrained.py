@@ -12,10 +12,9 @@ from wlplan import cli
 from wlplan.dataset import VARIABLES, Dataset, differences, probes, probes_of
 from wlplan.errors import InputError
 from wlplan.models.storage import load_model, read_description
-from wlplan.studies.diggability import edge_poses
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
-from wlplan.terrain.toe import toe_contour
+from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.training import train_all, weights
 from wlplan.types import action_from
 from wlplan.worlds.library import MODELS, load_world, pretrained_path

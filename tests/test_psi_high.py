@@ -15,10 +15,9 @@ from wlplan.models.normaliser import Normaliser
 from wlplan.models.psi_high import HighPerformanceModel, PrincipalComponents, PsiHigh
 from wlplan.models.storage import load_model, read_description
 from wlplan.site.soil import GRAVEL
-from wlplan.studies.diggability import edge_poses
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
-from wlplan.terrain.toe import toe_contour
+from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.training import PsiHighSettings, train
 from wlplan.types import LocalHeightmap, action_from
 from wlplan.worlds.library import load_world

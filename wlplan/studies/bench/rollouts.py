@@ -11,10 +11,9 @@ from jaxtyping import Array
 from wlplan.planning.rollout import rollout
 from wlplan.studies.bench.setup import LOADS, Item, Measured, Setup, floats, random_actions
 from wlplan.studies.bench.timing import compiled
-from wlplan.studies.diggability import edge_poses
 from wlplan.terrain.characteristics import as_vector, characteristics
 from wlplan.terrain.heightmap import sample_local
-from wlplan.terrain.toe import toe_contour
+from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.types import LoadingPlan, Performance, Pile, World, action_from
 
 _LOCATIONS = 150  # of a batch of inferences

@@ -18,10 +18,9 @@ from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.planning.rollout import rollout
 from wlplan.studies.bench.digs import Dig, random_digs, relaxed_seed_piles
 from wlplan.studies.bench.timing import Timed, Timing, compiled, timed
-from wlplan.studies.diggability import edge_poses
 from wlplan.terrain.automaton import settle, settle_dug
 from wlplan.terrain.seed_piles import SEED_PILES
-from wlplan.terrain.toe import toe_contour
+from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.types import LoadingPlan, Pile, Pose, World, action_from
 from wlplan.worlds.library import load_world
 
