@@ -3,9 +3,9 @@
 from .engines.dem.world import DiscreteElements as DiscreteElements
 from .engines.simulator import Simulator as Simulator
 from .errors import InputError as InputError
-from .io import read_pile as read_pile
-from .io import read_plan as read_plan
-from .io import write_pile as write_pile
+from .io.piles import read_pile as read_pile
+from .io.piles import write_pile as write_pile
+from .io.plans import read_plan as read_plan
 from .planning.objective import OBJECTIVES as OBJECTIVES
 from .planning.objective import Objective as Objective
 from .planning.plan import PlanResult as PlanResult
