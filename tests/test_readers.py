@@ -372,8 +372,7 @@ def reader(*endings, read=lambda path: None, **names):
 @pytest.mark.parametrize(
     ("candidate", "match"),
     [
-        (math, "math is no reader"),
-        (reader(".xyz", read=None), "mine is no reader"),
+        (reader(".xyz", read=3), "mine is no reader"),
         (reader(), "`ENDINGS`"),
         (reader("xyz"), "`ENDINGS`"),
         (reader(".XYZ"), "`ENDINGS`"),

@@ -40,7 +40,10 @@ ENTRY_POINTS = "wlplan.readers"
 class Reader(Protocol):
     """What reads one format; the module says more."""
 
-    ENDINGS: tuple[str, ...]
+    @property
+    def ENDINGS(self) -> tuple[str, ...]:  # noqa: N802
+        """Endings of its files, in lower case."""
+        ...
 
     def read(self, path: Path, /) -> Scan:
         """What a file holds, not yet checked."""
@@ -131,7 +134,7 @@ def _add(reader: Reader, readers: dict[str, Reader], taken: dict[str, Reader]) -
     readers.update(dict.fromkeys(reader.ENDINGS, reader))
 
 
-def _check(reader: Reader) -> None:
+def _check(reader: object) -> None:
     """Refuse what is no reader."""
     if not isinstance(reader, Reader) or not callable(reader.read):
         raise InputError(f"{_name(reader)} is no reader: it needs `ENDINGS` and `read(path)`.")
