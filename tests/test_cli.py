@@ -636,7 +636,6 @@ def test_no_command_shows_the_help(run):
 
 def test_the_names_offered_are_those_that_exist():
     assert cli.options.PROTOCOLS == dataset.PROTOCOLS
-    assert tuple(io.scans._READERS) == cli.inputs.PILE_ENDINGS
 
 
 def test_the_report_stands_alone_and_escapes_names(run, tmp_path):
@@ -703,6 +702,25 @@ def test_help_is_quick_and_imports_nothing_heavy():
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_an_unknown_ending_is_refused_before_anything_heavy_is_imported(tmp_path):
+    (tmp_path / "pile.abc").write_text("1 2 3")
+    code = (
+        "import sys, wlplan.cli; code = wlplan.cli.main(['plan', 'pile.abc']); "
+        "print(code, [name for name in ('jax', 'matplotlib', 'scipy') if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        cwd=tmp_path,
+    )
+    assert done.stdout.strip() == "2 []"
+    assert done.stderr.startswith("error: pile.abc: unknown kind of pile file")
+    assert done.stderr.count("\n") == 1
 
 
 def test_bad_usage_as_a_process(tmp_path):

@@ -3,10 +3,10 @@
 from .engines.dem.world import DiscreteElements as DiscreteElements
 from .engines.simulator import Simulator as Simulator
 from .errors import InputError as InputError
-from .io import read_pile as read_pile
-from .io import read_plan as read_plan
-from .io import write_pile as write_pile
-from .io import write_plan as write_plan
+from .io.piles import read_pile as read_pile
+from .io.piles import write_pile as write_pile
+from .io.plans import read_plan as read_plan
+from .io.plans import write_plan as write_plan
 from .planning import planners as planners
 from .planning.job import Job as Job
 from .planning.job import PlanResult as PlanResult

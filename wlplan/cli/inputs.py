@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from wlplan.terrain.toe import ToeContour
     from wlplan.types import Pile, World
 
-# Endings of the files that `wlplan.io` reads, repeated to keep help fast; a test compares them.
-PILE_ENDINGS = (".npz", ".tif", ".tiff", ".las", ".laz", ".ply")
-
 
 @dataclasses.dataclass(frozen=True)
 class NamedSite:
@@ -78,16 +75,15 @@ def check_pile_name(name: str) -> None:
     Raises:
         InputError: If it is missing, a folder, or of an unknown kind.
     """
+    from wlplan.io.readers import find_reader
+
     if name == BUNDLED:
         return
     if os.path.isdir(name):
         raise InputError(f"{name}: is a folder: name the pile file itself.")
     if not os.path.exists(name):
         raise InputError(f"{name}: no such pile file: check the name.")
-    if Path(name).suffix.lower() not in PILE_ENDINGS:
-        raise InputError(
-            f"{name}: unknown kind of pile file: use one of {', '.join(PILE_ENDINGS)}."
-        )
+    find_reader(Path(name))
 
 
 def check_models(model: str | None, pile_state: str | None, world: str) -> None:

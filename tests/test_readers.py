@@ -1,0 +1,405 @@
+"""Every format of pile files: read as it was written, refused in one line where it is broken."""
+
+import importlib
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scan_files import points_of, refused, save, write_las, write_ply, write_tif
+
+from wlplan import io
+from wlplan.errors import InputError
+from wlplan.io import readers
+from wlplan.io.readers import find_reader, known_endings, register_reader
+from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.volume import volume
+
+
+@pytest.fixture
+def pile():
+    return seed_pile("conical", slope=math.radians(30.0), height=2.0, seed=1)
+
+
+@pytest.fixture
+def fields(pile):
+    """What a valid .npz holds."""
+    return {"height": np.asarray(pile.height), "cell_size": 0.1, "origin": np.asarray(pile.origin)}
+
+
+# --- all formats
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"not a zip at all", bytes(1000)])
+@pytest.mark.parametrize("ending", known_endings())
+def test_files_of_something_else_are_refused(tmp_path, content, ending, capfd):
+    path = tmp_path / f"pile{ending}"
+    path.write_bytes(content)
+    refused(path, "pile")
+    assert capfd.readouterr() == ("", "")
+
+
+def damaged(content, random):
+    """Copies of a file that are cut short or have some bytes changed."""
+    for share in (0.1, 0.5, 0.9, 0.99):
+        yield content[: int(share * len(content))]
+    for _ in range(30):
+        changed = bytearray(content)
+        for place in random.integers(0, len(content), 4):
+            changed[place] = random.integers(0, 256)
+        yield bytes(changed)
+    for _ in range(20):  # the headers are where it hurts
+        changed = bytearray(content)
+        for place in random.integers(0, min(len(content), 400), 3):
+            changed[place] = random.integers(0, 256)
+        yield bytes(changed)
+
+
+def outcome(path):
+    """Return "read", or the message that a pile was refused with; anything else fails the test."""
+    try:
+        io.read_pile(path)
+    except InputError as error:
+        return str(error)
+    return "read"
+
+
+def check_damage(path, capfd):
+    content = path.read_bytes()
+    outcomes = []
+    for broken in damaged(content, np.random.default_rng(0)):
+        path.write_bytes(broken)
+        outcomes.append(outcome(path))
+    assert all("\n" not in message for message in outcomes)
+    assert sum(message != "read" for message in outcomes) >= 4
+    assert capfd.readouterr() == ("", "")
+
+
+# --- npz
+
+
+def test_a_single_array_is_refused(tmp_path, fields):
+    with (tmp_path / "pile.npz").open("wb") as file:
+        np.save(file, fields["height"])
+    refused(tmp_path / "pile.npz", "single array")
+
+
+def test_damaged_npz_files_are_refused_or_read_but_never_crash(tmp_path, fields, capfd):
+    fields["height"] = fields["height"][20:80, 20:80]
+    np.savez_compressed(tmp_path / "pile.npz", **fields)
+    check_damage(tmp_path / "pile.npz", capfd)
+
+
+# --- GeoTIFF
+
+
+def test_geotiff_rows_run_from_north_to_south(tmp_path, pile):
+    height = np.asarray(pile.height)
+    height = height + 0.001 * np.arange(height.shape[1])  # not the same in x and y
+    west, south = 100.0, 200.0
+    north = south + 0.1 * height.shape[1]
+    path = write_tif(tmp_path / "pile.tif", height.T[::-1], west=west, north=north)
+    again = io.read_pile(path)
+    np.testing.assert_allclose(again.height, height, atol=1e-6)
+    np.testing.assert_allclose(again.origin, [west + 0.05, south + 0.05], atol=1e-4)
+    assert again.valid is None
+
+
+def test_geotiff_that_runs_from_south_to_north(tmp_path, pile):
+    rasterio = pytest.importorskip("rasterio")
+    band = np.asarray(pile.height)
+    upward = rasterio.Affine(0.1, 0.0, 100.0, 0.0, 0.1, 200.0)
+    again = io.read_pile(write_tif(tmp_path / "pile.tiff", band.T.copy(), transform=upward))
+    np.testing.assert_allclose(again.height, band, atol=1e-6)
+    np.testing.assert_allclose(again.origin, [100.05, 200.05], atol=1e-4)
+
+
+def test_geotiff_nodata_and_nan_are_unseen(tmp_path, pile):
+    band = np.asarray(pile.height).T.copy()
+    band[10, 20:30], band[12, 5] = -9999.0, np.nan
+    again = io.read_pile(write_tif(tmp_path / "pile.tif", band, nodata=-9999.0))
+    assert int(np.sum(~np.asarray(again.valid))) == 11
+    assert float(again.height.min()) == 0.0
+
+
+def test_geotiff_in_survey_coordinates(tmp_path, pile):
+    band = np.asarray(pile.height).T + np.float32(64.0)
+    path = write_tif(tmp_path / "p.tif", band, west=431_000.0, north=6_512_900.0, crs="EPSG:32633")
+    again = io.read_pile(path)
+    np.testing.assert_allclose(again.origin, [0.05, 900.0 - 0.1 * len(band) + 0.05], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"crs": "EPSG:4326"}, "metres"),
+        ({"crs": "EPSG:2263"}, "metres"),  # US survey feet
+        ({"transform": (0.1, 0.0, 0.0, 0.0, -0.2, 0.0)}, "square"),
+        ({"transform": (0.1, 0.02, 0.0, 0.02, -0.1, 0.0)}, "square"),
+        ({"transform": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)}, "no georeference"),
+        ({"step": 50.0}, "4000 cells"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_geotiffs_without_square_metric_cells_are_refused(tmp_path, pile, options, match):
+    rasterio = pytest.importorskip("rasterio")
+    if "transform" in options:
+        options = {**options, "transform": rasterio.Affine(*options["transform"])}
+    refused(write_tif(tmp_path / "pile.tif", np.asarray(pile.height), **options), match)
+
+
+def test_damaged_geotiffs_are_refused_or_read_but_never_crash(tmp_path, pile, capfd):
+    write_tif(tmp_path / "pile.tif", np.asarray(pile.height)[20:80, 20:80], compress="deflate")
+    check_damage(tmp_path / "pile.tif", capfd)
+
+
+# --- point clouds
+
+
+@pytest.mark.parametrize("ending", [".las", ".laz", ".ply"])
+def test_point_clouds_are_gridded(tmp_path, pile, ending):
+    points = points_of(pile, np.random.default_rng(0))
+    write = write_ply if ending == ".ply" else write_las
+    again = io.read_pile(write(tmp_path / f"pile{ending}", points))
+    assert again.height.shape == pile.height.shape
+    np.testing.assert_allclose(again.origin, pile.origin, atol=2e-3)
+    valid = np.ones(pile.height.shape, bool) if again.valid is None else np.asarray(again.valid)
+    assert valid.mean() > 0.99
+    error = np.abs(np.asarray(again.height - pile.height))
+    assert np.median(error) < 1e-3
+    assert np.quantile(error, 0.99) < 0.1  # cells filled from their neighbours
+    assert volume(again) == pytest.approx(float(volume(pile)), rel=0.01)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_ply_encodings_read_alike(tmp_path, pile, encoding):
+    points = points_of(pile, np.random.default_rng(0), 20_000)
+    want = io.read_pile(write_ply(tmp_path / "a.ply", points))
+    again = io.read_pile(write_ply(tmp_path / "b.ply", points, encoding))
+    np.testing.assert_allclose(again.height, want.height, atol=2e-3)
+
+
+def test_cells_without_points_are_unseen_and_filled(tmp_path, pile):
+    points = points_of(pile, np.random.default_rng(0), 200_000)
+    hole = np.hypot(points[:, 0] - 1.0, points[:, 1]) < 0.8
+    again = io.read_pile(write_ply(tmp_path / "pile.ply", points[~hole]))
+    assert np.sum(~np.asarray(again.valid)) * 0.01 == pytest.approx(math.pi * 0.8**2, rel=0.2)
+    assert np.isfinite(again.height).all()
+
+
+def test_the_median_of_a_cell_ignores_a_bird(tmp_path, pile):
+    points = points_of(pile, np.random.default_rng(0), 100_000)
+    points[7, 2] += 30.0
+    again = io.read_pile(write_ply(tmp_path / "pile.ply", points))
+    assert float(again.height.max()) < 3.0
+
+
+def test_a_sparse_cloud_is_gridded_by_its_spacing(tmp_path, pile):
+    points = points_of(pile, np.random.default_rng(0), 1500)
+    again = io.read_pile(write_ply(tmp_path / "pile.ply", points))
+    assert again.cell_size == 0.1
+    assert np.mean(np.ones(1) if again.valid is None else np.asarray(again.valid)) > 0.7
+    assert volume(again) == pytest.approx(float(volume(pile)), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        (b"property double z\n", b"property double q\n", "no x, y and z"),
+        (b"element vertex", b"element face", "vertices"),
+        (b"binary_little_endian", b"binary_middle_endian", "unknown format"),
+        (b"property float y", b"property list uchar int y", "vertices of type"),
+        (b"vertex 9000", b"vertex 9999999", "cut short"),
+        (b"vertex 9000", b"vertex many", "cannot be read"),
+        (b"vertex 9000", b"vertex 0", "three points"),
+    ],
+)
+def test_bad_ply_headers_are_refused(tmp_path, pile, old, new, match):
+    path = write_ply(tmp_path / "pile.ply", points_of(pile, np.random.default_rng(0), 9000))
+    path.write_bytes(path.read_bytes().replace(old, new, 1))
+    refused(path, match)
+
+
+def test_a_cloud_with_a_point_far_off_is_refused(tmp_path, pile):
+    points = points_of(pile, np.random.default_rng(0), 9000)
+    points[0, 0] = 5000.0
+    refused(write_ply(tmp_path / "pile.ply", points), "crop it")
+
+
+@pytest.mark.parametrize("ending", [".las", ".laz", ".ply"])
+def test_damaged_point_clouds_are_refused_or_read_but_never_crash(tmp_path, pile, ending, capfd):
+    points = points_of(pile, np.random.default_rng(0), 3000)
+    write = write_ply if ending == ".ply" else write_las
+    check_damage(write(tmp_path / f"pile{ending}", points), capfd)
+
+
+@pytest.mark.parametrize(("ending", "module"), [(".tif", "rasterio"), (".laz", "laspy")])
+def test_a_missing_reader_says_what_to_install(tmp_path, monkeypatch, ending, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    path = tmp_path / f"pile{ending}"
+    path.write_bytes(b"x")
+    refused(path, r"pip install wlplan\[scan\]")
+
+
+# --- the readers themselves
+
+ROOT = Path(__file__).parents[1]
+MODULES = sorted(path.stem for path in (ROOT / "wlplan/io/readers").glob("[!_]*.py"))
+
+
+def in_a_process(code, path):
+    """What a fresh interpreter prints that finds modules and packages in a folder, too."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path[:0] = {[str(ROOT), str(path)]}; {code}"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    return done.stdout.strip()
+
+
+def test_every_reader_declares_its_endings_and_no_two_the_same():
+    modules = [importlib.import_module(f"wlplan.io.readers.{name}") for name in MODULES]
+    endings = [ending for module in modules for ending in module.ENDINGS]
+    assert len(modules) >= 4
+    assert all(module.__doc__ and all(module.ENDINGS) for module in modules)
+    assert all(re.fullmatch(r"\.[a-z0-9]+", ending) for ending in endings)
+    assert len(endings) == len(set(endings))
+    assert set(endings) <= set(known_endings())
+    for module in modules:
+        for ending in module.ENDINGS:
+            assert find_reader(Path(f"PILE{ending.upper()}")) is module
+
+
+def test_endings_are_told_without_the_libraries_of_the_formats_or_jax(tmp_path):
+    """Of what is no part of Python, only numpy may be imported."""
+    code = (
+        "before = set(sys.modules); from wlplan.io import readers; readers.known_endings(); "
+        "names = {name.split('.')[0] for name in set(sys.modules) - before}; "
+        "print(sorted(names - set(sys.stdlib_module_names) - {'wlplan', 'numpy', 'lazy_loader'}))"
+    )
+    assert in_a_process(code, tmp_path) == "[]"
+
+
+EXAMPLE = re.search(
+    r"## Your own reader\n.*?```python\n(.*?)```", (ROOT / "docs/extending.md").read_text(), re.S
+).group(1)
+
+
+@pytest.fixture
+def xyz(tmp_path, monkeypatch):
+    """The example of the documentation as a module that can be imported, its name on the path."""
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    (folder / "their_xyz.py").write_text(EXAMPLE)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setattr(readers, "_registered", {})
+    monkeypatch.delitem(sys.modules, "their_xyz", raising=False)
+    return folder
+
+
+def offer(folder, package, *lines):
+    """Let a folder look like one that a package with entry points was installed into."""
+    info = folder / f"{package}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    text = "\n".join(["[wlplan.readers]", *lines])
+    (info / "entry_points.txt").write_text(text)
+
+
+def write_xyz(path, points):
+    np.savetxt(path, points, "%.4f", header="x y z", comments="# ")
+    return path
+
+
+def test_the_documented_reader_reads_a_cloud_once_it_is_registered(tmp_path, pile, xyz):
+    points = points_of(pile, np.random.default_rng(0), 20_000)
+    path = write_xyz(tmp_path / "pile.xyz", points)
+    refused(path, r"unknown kind of pile file '\.xyz'")
+    module = importlib.import_module("their_xyz")
+    register_reader(module)
+    register_reader(module)  # nothing new
+    assert ".xyz" in known_endings()
+    want = io.read_pile(write_ply(tmp_path / "pile.ply", np.round(points, 4)))
+    np.testing.assert_allclose(io.read_pile(path).height, want.height, atol=1e-3)
+    path.write_text("1 2\n3 4\n")
+    refused(path, "fewer than three numbers")
+    path.write_text("one two three\n")
+    refused(path, r"cannot be read as \.xyz")
+
+
+def test_the_documented_reader_comes_with_a_package(tmp_path, pile, xyz):
+    offer(xyz, "theirs", "xyz = their_xyz")
+    path = write_xyz(tmp_path / "pile.xyz", points_of(pile, np.random.default_rng(0), 2000))
+    assert ".xyz" in known_endings()
+    assert "their_xyz" not in sys.modules  # only loaded for a file of its own
+    assert np.isfinite(io.read_pile(path).height).all()
+    check = f"from wlplan.cli import inputs; inputs.check_pile_name({str(path)!r})"
+    assert in_a_process(f"{check}; print('jax' in sys.modules)", xyz) == "False"
+
+
+@pytest.mark.parametrize(
+    ("lines", "match"),
+    [
+        (["xyz = no_such_module"], "no_such_module, which reads .xyz, cannot be used .*No module"),
+        (["xyz = math"], "math is no reader"),
+        (["xyz = their_xyz:ENDINGS"], "tuple is no reader"),
+    ],
+)
+def test_a_package_with_a_broken_reader_is_named(tmp_path, fields, xyz, lines, match):
+    offer(xyz, "theirs", *lines)
+    (tmp_path / "pile.xyz").write_text("1 2 3")
+    refused(tmp_path / "pile.xyz", match)
+    io.read_pile(save(tmp_path / "pile.npz", fields))  # all others are read as ever
+
+
+def test_two_packages_for_one_ending_are_refused(tmp_path, xyz):
+    offer(xyz, "theirs", "xyz = their_xyz")
+    offer(xyz, "others", "XYZ = others_xyz")
+    (tmp_path / "pile.xyz").write_text("1 2 3")
+    refused(tmp_path / "pile.xyz", "others_xyz and their_xyz both read .xyz")
+
+
+def reader(*endings, read=lambda path: None, **names):
+    return SimpleNamespace(__name__="mine", ENDINGS=endings, read=read, **names)
+
+
+@pytest.mark.parametrize(
+    ("candidate", "match"),
+    [
+        (reader(".xyz", read=3), "mine is no reader"),
+        (reader(), "`ENDINGS`"),
+        (reader("xyz"), "`ENDINGS`"),
+        (reader(".XYZ"), "`ENDINGS`"),
+        (reader(".xyz", ".a.b"), "`ENDINGS`"),
+        (reader(".xyz", 3), "`ENDINGS`"),
+        (SimpleNamespace(ENDINGS=".xyz", read=len), "`ENDINGS`"),
+        (reader(".xyz", ".ply"), r"mine reads \.ply, as wlplan\.io\.readers\.ply does already"),
+    ],
+)
+def test_what_is_no_reader_is_not_registered(monkeypatch, candidate, match):
+    monkeypatch.setattr(readers, "_registered", {})
+    with pytest.raises(InputError, match=match):
+        register_reader(candidate)
+    assert ".xyz" not in known_endings()
+
+
+@pytest.mark.parametrize("points", [np.zeros((5, 2)), np.zeros(3), np.full((5, 3), "a")])
+def test_points_that_are_no_points_are_refused(tmp_path, monkeypatch, points):
+    monkeypatch.setattr(readers, "_registered", {})
+    register_reader(reader(".xyz", read=lambda path: io.PointCloud(points)))
+    (tmp_path / "pile.xyz").write_text("")
+    refused(tmp_path / "pile.xyz", "`points`")
+
+
+def test_a_reader_that_returns_something_else_is_a_fault_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(readers, "_registered", {})
+    register_reader(reader(".xyz"))
+    (tmp_path / "pile.xyz").write_text("")
+    with pytest.raises(TypeError, match="returned None"):
+        io.read_pile(tmp_path / "pile.xyz")

@@ -1,0 +1,194 @@
+"""Piles on disk: what the readers find in a file is checked and put on the grid of the models.
+
+The world frame of a scan is its own, x east, y north, z up, in metres. Coordinates of a survey are
+too large for float32, so whole kilometres are taken off x and y when the map lies more than 10 km
+from zero, and whole hundreds of metres off z when its lowest point is more than 100 m from zero:
+the last digits of the survey's coordinates stay as they are.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import warnings
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from wlplan.constants import CELL_SIZE
+from wlplan.errors import InputError
+from wlplan.io.clouds import grid_points
+from wlplan.io.files import check_is_file, named, one_line, write_bytes_atomic
+from wlplan.io.readers import find_reader
+from wlplan.io.scans import Heightmap, PointCloud, check_size, real_numbers
+from wlplan.terrain.floor import estimate_ground, fill_unseen
+from wlplan.terrain.resampling import resample
+from wlplan.types import Pile
+from wlplan.xla import floats
+
+# Largest difference in height on a map and largest coordinate [m]; beyond, units are wrong or a
+# nodata value was taken for a height.
+_MOST_RELIEF = 200.0
+_FARTHEST = 1.0e8
+# Coordinates above which whole kilometres, and heights above which whole hundreds of metres, are
+# taken off [m]: float32 resolves 1 mm at the one and 0.01 mm at the other.
+_FAR = 10_000.0
+_HIGH = 100.0
+
+
+def bundled_pile_path() -> Path:
+    """Path of the pile that ships with the package, a published heightmap of a built soil mound."""
+    return Path(str(resources.files("wlplan").joinpath("data", "marsyard2022_mound.npz")))
+
+
+def read_pile(
+    path: str | os.PathLike[str],
+    *,
+    ground: Float[Array | np.ndarray, "nx ny"] | float | None = None,
+) -> Pile:
+    """Read a pile and resample it to the grid spacing of the models, 0.1 m.
+
+    The ending of the name tells the format: height maps are `.npz` or GeoTIFF, point clouds LAS,
+    LAZ or PLY, all in metres, z up. The modules of `wlplan.io.readers`, one for each format, say
+    what a file has to hold; `wlplan.io.register_reader` takes more of them. The height of a cell of
+    a point cloud is the median of its points; cells without points are unseen, but for single ones
+    amid seen cells.
+
+    Unseen cells are filled smoothly from seen ones; a fill that the file brings is kept where it
+    lies within the range of the seen heights. Coordinates far from zero: see the module.
+
+    Args:
+        path: File to read.
+        ground: Floor under the pile [m] in the file's frame: a level, or a map on the grid of the
+            file. By default that of the file, else `terrain.floor.estimate_ground` finds it around
+            the toe. It is lowered to the surface wherever it lies above.
+
+    Returns:
+        The pile on the 0.1 m grid, with its ground.
+
+    Raises:
+        InputError: If the file cannot be used; one line that says why and what to do.
+    """
+    path = Path(path)
+    reader = find_reader(path)
+    check_is_file(path, "pile")
+    with named(path):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                scan = reader.read(path)
+                if isinstance(scan, PointCloud):
+                    scan = grid_points(scan)
+        except InputError:
+            raise
+        except Exception as error:
+            # Damaged bytes make third-party readers raise almost anything, from zlib.error to
+            # MemoryError; to the user they all mean the same.
+            raise InputError(
+                f"cannot be read as {path.suffix.lower()} ({one_line(error)}): the file is "
+                f"damaged or cut short; copy or export it again."
+            ) from error
+        if not isinstance(scan, Heightmap):
+            raise TypeError(f"The reader of {path} returned {scan!r}: not a Heightmap, PointCloud.")
+        return _to_pile(scan, ground)
+
+
+def _to_pile(scan: Heightmap, ground: Array | np.ndarray | float | None) -> Pile:
+    """Check a scan, fill its gaps, resample it and find its ground."""
+    height, origin = real_numbers("height", scan.height), real_numbers("origin", scan.origin)
+    if height.ndim != 2:
+        raise InputError(f"`height` has shape {height.shape}: it has to be 2-D, x by y.")
+    shape = height.shape
+    check_size(shape, scan.cell_size)
+    if origin.shape != (2,) or not (np.abs(origin) <= _FARTHEST).all():
+        raise InputError("`origin` has to be x and y of the first cell, two numbers in metres.")
+    valid = _valid(scan.valid, shape)
+    bad = int(np.sum(valid & ~np.isfinite(height)))
+    if bad:
+        raise InputError(
+            f"`height` is NaN or infinite in {bad} cells that count as seen: mark them as unseen "
+            f"(False in `valid`, or nodata)."
+        )
+    if not valid.any():
+        raise InputError("no cell counts as seen: check the mask or the nodata value.")
+    low, high = float(height[valid].min()), float(height[valid].max())
+    if not (high - low <= _MOST_RELIEF and abs(low) <= _FARTHEST):
+        raise InputError(
+            f"the heights run from {low:.6g} to {high:.6g} m, which is no pile: check the units "
+            f"and the nodata value."
+        )
+    with np.errstate(invalid="ignore"):
+        known = valid | ((height >= low) & (height <= high))
+    height = fill_unseen(height, known)
+
+    floor = scan.ground if ground is None else ground
+    if isinstance(floor, float | int):
+        floor = np.full(shape, float(floor))
+    if floor is not None:
+        floor = real_numbers("ground", floor)
+        if floor.shape != shape:
+            raise InputError(f"`ground` has shape {floor.shape}, but `height` {shape}.")
+        if not (np.abs(floor[valid] - low) <= _MOST_RELIEF).all():
+            raise InputError(
+                f"`ground` is NaN or more than {_MOST_RELIEF:g} m off the surface in cells that "
+                f"count as seen: check its units, or leave it out."
+            )
+        known = np.abs(floor - low) <= _MOST_RELIEF
+        floor = np.minimum(fill_unseen(floor, known), height)
+
+    centre = origin + 0.5 * scan.cell_size * np.array(shape)
+    origin = origin - np.where(np.abs(centre) > _FAR, 1000.0 * np.floor(centre / 1000.0), 0.0)
+    sea_level = 100.0 * math.floor(low / 100.0) if abs(low) > _HIGH else 0.0
+    pile = resample(
+        Pile(
+            height=floats(height - sea_level),
+            cell_size=scan.cell_size,
+            origin=floats(origin),
+            ground=None if floor is None else floats(floor - sea_level),
+            valid=None if valid.all() else jnp.asarray(valid),
+        ),
+        CELL_SIZE,
+    )
+    if floor is None:
+        found = floats(estimate_ground(pile.height, CELL_SIZE, pile.valid))
+        pile = pile.replace(ground=jnp.minimum(found, pile.height))
+    return pile.replace(cell_size=CELL_SIZE)
+
+
+def _valid(valid: np.ndarray | None, shape: tuple[int, ...]) -> Bool[np.ndarray, "nx ny"]:
+    if valid is None:
+        return np.ones(shape, bool)
+    if valid.shape != shape:
+        raise InputError(f"`valid` has shape {valid.shape}, but `height` {shape}.")
+    if valid.dtype != bool and not (valid.dtype.kind in "iuf" and np.isin(valid, (0, 1)).all()):
+        raise InputError("`valid` holds values other than True and False: store it as bool.")
+    return valid.astype(bool)
+
+
+def write_pile(path: str | os.PathLike[str], pile: Pile) -> None:
+    """Write one pile as .npz, in the format of `read_pile`, in one piece or not at all.
+
+    The ground is always written, so that reading does not estimate it anew.
+
+    Raises:
+        InputError: If the name does not end in .npz or the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".npz":
+        raise InputError(f"{path}: piles are written as .npz: choose a name with that ending.")
+    fields: dict[str, Any] = {
+        "height": np.asarray(pile.height),
+        "cell_size": np.float64(pile.cell_size),
+        "origin": np.asarray(pile.origin),
+        "ground": np.asarray(pile.floor),
+    }
+    if pile.valid is not None:
+        fields["valid"] = np.asarray(pile.valid)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **fields)
+    write_bytes_atomic(path, buffer.getvalue())

@@ -1,0 +1,46 @@
+"""`.npz`: the arrays of a height map as numpy saves them; the format of `wlplan.write_pile`.
+
+`height` [nx, ny] [m], `cell_size` [m], optional `origin` [2] [m] (centre of cell [0, 0], by default
+zero), `valid` bool [nx, ny] and `ground` [nx, ny] [m]. Axis 0 is x, axis 1 is y.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from wlplan.errors import InputError
+from wlplan.io.scans import Heightmap, real_numbers
+
+ENDINGS = (".npz",)
+
+
+def read(path: Path) -> Heightmap:
+    """Read the arrays; none of them may need pickle.
+
+    Raises:
+        InputError: If `height` or `cell_size` is missing, or the latter is no number.
+    """
+    with path.open("rb") as file:
+        archive = np.load(file, allow_pickle=False)
+        if isinstance(archive, np.ndarray):
+            raise InputError("holds a single array: save it by np.savez with height and cell_size.")
+        # Every field is read here, so that damage shows up here.
+        fields = {name: archive[name] for name in archive.files}
+    for name in ("height", "cell_size"):
+        if name not in fields:
+            raise InputError(
+                f"has no field `{name}`, only {sorted(fields)}: save `height` [nx, ny] in metres "
+                f"and `cell_size` in metres."
+            )
+    cell_size = real_numbers("cell_size", fields["cell_size"])
+    if cell_size.size != 1:
+        raise InputError(f"`cell_size` has shape {cell_size.shape}: it has to be one number.")
+    return Heightmap(
+        height=fields["height"],
+        cell_size=float(cell_size.reshape(())),
+        origin=fields.get("origin", np.zeros(2)),
+        valid=fields.get("valid"),
+        ground=fields.get("ground"),
+    )
