@@ -818,7 +818,7 @@ def test_a_merge_that_does_not_end_leaves_nothing(longer, parts, tmp_path, monke
         merge(parts, out, progress=stop)
     assert [entry.name for entry in tmp_path.iterdir()] == ["parts"]
     # What a killed process leaves: its hidden folder, and its lock.
-    (tmp_path / ".out.zarr.new" / "mass").mkdir(parents=True)
+    (tmp_path / ".out.zarr.0123456789ab.tmp" / "mass").mkdir(parents=True)
     (tmp_path / "out.zarr.lock").write_text(f"99999999 1 {socket.gethostname()}")
     merge(parts, out)
     assert contents(out) == contents(longer)

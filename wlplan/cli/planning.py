@@ -36,7 +36,7 @@ from wlplan.cli.options import (
     with_options,
     world_option,
 )
-from wlplan.cli.outputs import checked_folder, json_text, remark, staged
+from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.played import ledger_of, print_plan, remark_on_ledger, totals, transport_totals
 from wlplan.cli.progress import Progress, Stopwatch, ready
 from wlplan.constants import QUANTITIES
@@ -184,6 +184,7 @@ def _write_plan(
     seconds: Mapping[str, str],
 ) -> None:
     from wlplan.io import write_bytes_atomic, write_plan
+    from wlplan.io.files import atomic_folder
     from wlplan.report import figures as plots
     from wlplan.report.page import write_report
 
@@ -200,7 +201,7 @@ def _write_plan(
     totals_png = plots.png_bytes(
         plots.totals_figure(planned.rollout.performance, simulated.rollout.performance)
     )
-    with staged(folder) as staging:
+    with atomic_folder(folder, existing="add") as staging:
         write_plan(staging / "plan.json", document)
         write_bytes_atomic(staging / "plan.png", map_png)
         write_bytes_atomic(staging / "totals.png", totals_png)
