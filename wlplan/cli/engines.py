@@ -9,7 +9,7 @@ from wlplan.cli.outputs import remark
 from wlplan.cli.progress import ready
 
 if TYPE_CHECKING:
-    from wlplan.engines.dem.cycle import Played
+    from wlplan.engines.dem.cycle import CycleRecord
     from wlplan.engines.dem.world import DiscreteElements
     from wlplan.planning.plan import PlanResult
     from wlplan.planning.transport import Receiver
@@ -89,14 +89,14 @@ def _load_by_load(
     return judge(outcome, pile, plan, objective=objective, receiver=receiver), cycles
 
 
-def _fields(played: Played) -> dict[str, Any]:
+def _fields(cycle: CycleRecord) -> dict[str, Any]:
     """What plan.json says of a cycle: SI units, but for the work of the wheels' slip [kJ]."""
     from wlplan.constants import J_PER_KJ
 
     return {
-        "stop_reason": played.stop_reason,
-        "slip_work": played.work_slip / J_PER_KJ,
-        "spheres": played.spheres,
-        "cleared_volume": played.cleared,
-        "lost_volume": played.lost,
+        "stop_reason": cycle.stop_reason,
+        "slip_work": cycle.work_slip / J_PER_KJ,
+        "spheres": cycle.spheres,
+        "cleared_volume": cycle.cleared,
+        "lost_volume": cycle.lost,
     }

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from wlplan.dataset import store
-from wlplan.dataset.protocol import Layout
+from wlplan.dataset.layout import Layout
 from wlplan.dataset.variables import VARIABLES
 from wlplan.errors import InputError
 from wlplan.io.files import atomic_folder

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from wlplan.dataset.protocol import Layout
+from wlplan.dataset.layout import Layout
 from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, h36_after
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
