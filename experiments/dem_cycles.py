@@ -22,7 +22,7 @@ import numpy as np
 from experiments.dem_reference import MACHINE
 from wlplan.constants import ACTION_HIGH, ACTION_LOW, J_PER_KJ, KG_PER_TONNE
 from wlplan.engines.dem import columns, process
-from wlplan.engines.dem.cycle import Played
+from wlplan.engines.dem.cycle import CycleRecord
 from wlplan.engines.dem.grains import Settings
 from wlplan.engines.dem.loader import RECORDED
 from wlplan.errors import InputError
@@ -141,32 +141,32 @@ def next_cycle(
     return surface, action, packing, origin
 
 
-def row_of(played: Played, action: np.ndarray, origin: dict[str, Any]) -> dict[str, Any]:
+def row_of(cycle: CycleRecord, action: np.ndarray, origin: dict[str, Any]) -> dict[str, Any]:
     """What the file says of one cycle."""
 
     def small(height: np.ndarray) -> np.ndarray:
         return np.round(height / _UNIT).astype(np.int16)
 
     record = np.full((_ROWS, len(RECORDED)), np.nan, np.float32)
-    record[: len(played.record)] = played.record[:_ROWS]
-    works = np.array([played.work_drive, played.work_boom, played.work_bucket, played.work_slip])
+    record[: len(cycle.record)] = cycle.record[:_ROWS]
+    works = np.array([cycle.work_drive, cycle.work_boom, cycle.work_bucket, cycle.work_slip])
     return {
-        "h0": small(played.envelope_before),
-        "h1": small(played.envelope_after),
-        "h0_cg": small(played.before),
-        "h1_cg": small(played.after),
+        "h0": small(cycle.envelope_before),
+        "h1": small(cycle.envelope_after),
+        "h0_cg": small(cycle.before),
+        "h1_cg": small(cycle.after),
         "action": action,
-        "mass_t": played.mass / KG_PER_TONNE,
-        "time_s": played.time,
+        "mass_t": cycle.mass / KG_PER_TONNE,
+        "time_s": cycle.time,
         "work_kJ": works[:3].sum() / J_PER_KJ,
         "work_with_slip_kJ": works.sum() / J_PER_KJ,
         "work_parts_kJ": works / J_PER_KJ,
-        "fill_time_s": played.fill_time,
-        "stop_reason": played.stop_reason,
-        "tip_at_stop": np.array([played.tip_x, played.tip_z]),
-        "cleared_t": played.cleared * GRAVEL.density / KG_PER_TONNE,
-        "lost_t": played.lost * GRAVEL.density / KG_PER_TONNE,
-        "spheres": played.spheres,
+        "fill_time_s": cycle.fill_time,
+        "stop_reason": cycle.stop_reason,
+        "tip_at_stop": np.array([cycle.tip_x, cycle.tip_z]),
+        "cleared_t": cycle.cleared * GRAVEL.density / KG_PER_TONNE,
+        "lost_t": cycle.lost * GRAVEL.density / KG_PER_TONNE,
+        "spheres": cycle.spheres,
         "traj": record,
         **origin,
     }

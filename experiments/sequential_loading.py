@@ -24,7 +24,7 @@ from experiments.record import described, main
 from experiments.trained import shortened, trained
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
-from wlplan.dataset.protocol import Rollout, choose_pose
+from wlplan.dataset.protocol import Episode, choose_pose
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic
@@ -144,11 +144,11 @@ def learned_worlds(
 def simulated(number: int, loads: int) -> Sequence:
     """A sequence of the data set's protocol: random places at the toe as it is, random actions."""
     simulator = Simulator()
-    rollout = Rollout(number, SEED, loads, simulator, length=loads)
-    rollout.heap()
-    pile = Pile(rollout.height, CELL_SIZE, rollout.origin)
+    episode = Episode(number, SEED, loads, simulator, length=loads)
+    episode.reset()
+    pile = Pile(episode.height, CELL_SIZE, episode.origin)
     heights, poses, outcomes = [np.asarray(pile.height)], [], []
-    for place, turn, action in zip(rollout.place, rollout.turn, rollout.action, strict=True):
+    for place, turn, action in zip(episode.place, episode.turn, episode.action, strict=True):
         pose = choose_pose(pile, place, turn)
         if pose is None:
             raise RuntimeError(f"pile {number} is used up after {len(poses)} loads")
@@ -157,10 +157,10 @@ def simulated(number: int, loads: int) -> Sequence:
         poses.append(pose)
         outcomes.append([float(getattr(performance, name)) for name in OUTCOMES])
     return Sequence(
-        rollout.seed_pile,
-        np.asarray(rollout.origin),
+        episode.seed_pile,
+        np.asarray(episode.origin),
         np.array(poses),
-        rollout.action,
+        episode.action,
         np.array(outcomes),
         np.array(heights),
     )

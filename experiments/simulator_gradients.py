@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 import wlplan
 from experiments.record import main
 from wlplan.constants import ACTION_HIGH, ACTION_LOW, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
-from wlplan.dataset.protocol import Rollout, choose_pose
+from wlplan.dataset.protocol import Episode, choose_pose
 from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
@@ -68,15 +68,15 @@ def random_cases(rollouts: int, loads: int) -> tuple[np.ndarray, np.ndarray, np.
     play = jax.jit(lambda pile, pose, action: simulator(pile, pose, action)[0].height)
     heights, origins, vectors = [], [], []
     for number in range(rollouts):
-        rollout = Rollout(number, SEED, loads, simulator)
-        rollout.heap()
-        height, origin = rollout.height, rollout.origin
+        episode = Episode(number, SEED, loads, simulator)
+        episode.reset()
+        height, origin = episode.height, episode.origin
         for load in range(loads):
             pile = Pile(height, CELL_SIZE, origin)
-            pose = choose_pose(pile, rollout.place[load], rollout.turn[load])
+            pose = choose_pose(pile, episode.place[load], episode.turn[load])
             if pose is None:
                 break
-            action = rollout.action[load]
+            action = episode.action[load]
             heights.append(np.asarray(height, np.float64))
             origins.append(np.asarray(origin, np.float64))
             vectors.append(np.concatenate([pose, action]).astype(np.float64))

@@ -30,22 +30,24 @@ from wlplan.constants import ACTION_HIGH, ACTION_LOW, CELL_SIZE
 from wlplan.dataset import (
     VARIABLES,
     Dataset,
-    batches,
     collect,
     collecting,
-    crew,
     fingerprint,
+    layout,
     merge,
     merging,
     open_dataset,
     protocol,
     reflect,
     split,
-    workbench,
+    vector_simulator,
+    worker_pool,
 )
 from wlplan.dataset import store as stored
-from wlplan.dataset.protocol import Layout, Rollout, choose_pose
-from wlplan.dataset.worker import simulator_from
+from wlplan.dataset.layout import Layout
+from wlplan.dataset.protocol import Episode, choose_pose
+from wlplan.dataset.worker import simulator_from_json
+from wlplan.dataset.worker_pool import CollectionSettings, WorkerProcess
 from wlplan.engines.simulator import STOP_REASONS, Simulator
 from wlplan.engines.simulator.cycle import Settings
 from wlplan.errors import InputError
@@ -63,12 +65,12 @@ LONGER = 17
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _short_rollouts():
-    """Rollouts of 3 loadings, two a batch: 11 cycles make two batches."""
+def _short_episodes():
+    """Episodes of 3 loadings, two a batch: 11 cycles make two batches."""
     with pytest.MonkeyPatch.context() as patch:
-        for part in (protocol, batches, collecting, stored):
+        for part in (layout, protocol, worker_pool, collecting, stored):
             patch.setattr(part, "LOADS", 3)
-        patch.setattr(protocol, "_BATCH", 2)
+        patch.setattr(layout, "_BATCH", 2)
         yield
 
 
@@ -78,20 +80,20 @@ def kept_workers():
     kept = []
 
     @contextlib.contextmanager
-    def hired(count):
-        kept.extend(crew.Worker() for _ in range(count - len(kept)))
+    def pool(count):
+        kept.extend(WorkerProcess() for _ in range(count - len(kept)))
         yield kept[:count]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batches, "hired", hired)
+        patch.setattr(worker_pool, "worker_pool", pool)
         yield kept
     for worker in kept:
-        worker.end()
+        worker.close()
 
 
 @pytest.fixture
 def worker(kept_workers, store):
-    """A worker that has played before."""
+    """A worker that has compiled before."""
     return kept_workers[0]
 
 
@@ -233,22 +235,21 @@ def test_the_volume_that_the_map_loses_is_about_the_load(data):
     assert np.median(lost / data.mass) > 0.7
 
 
-def played(rollout):
-    """A rollout after all its loadings, alone on its bench."""
-    rollouts, finished = iter([rollout]), []
-    bench = workbench.Bench(
-        Simulator(), lambda: next(rollouts, None), finished.append, threading.Event()
-    )
-    bench.run()
-    assert finished == [None] * rollout.loads + [rollout]
-    return rollout
+def simulated(episode):
+    """An episode after all its loadings, with no other beside it."""
+    episodes, finished = iter([episode]), []
+    vector_simulator.VectorSimulator(
+        Simulator(), lambda: next(episodes, None), finished.append, threading.Event()
+    ).run()
+    assert finished == [None] * episode.loads + [episode]
+    return episode
 
 
-def test_a_rollout_does_not_depend_on_those_beside_it(data, worker):
+def test_an_episode_does_not_depend_on_those_beside_it(data, worker):
     for number in (0, 2):
         numbers, finished = iter([number]), []
-        session = crew.Session(Simulator(), SEED, 3, 3)
-        worker.play(session, lambda numbers=numbers: next(numbers, None), finished.append)
+        settings = CollectionSettings(Simulator(), SEED, 3, 3)
+        worker.simulate(settings, lambda numbers=numbers: next(numbers, None), finished.append)
         *loadings, (found, alone) = finished
         assert loadings == [None] * 3
         assert found == number
@@ -257,11 +258,11 @@ def test_a_rollout_does_not_depend_on_those_beside_it(data, worker):
 
 
 def test_what_left_the_grid_is_the_load():
-    rollout = Rollout(3, SEED, 1, Simulator())
-    rollout.heap()
-    before, origin = rollout.height, rollout.origin
-    after = played(rollout).height
-    record = {name: values[0] for name, values in rollout.records().items()}
+    episode = Episode(3, SEED, 1, Simulator())
+    episode.reset()
+    before, origin = episode.height, episode.origin
+    after = simulated(episode).height
+    record = {name: values[0] for name, values in episode.records().items()}
     lost = np.sum(np.asarray(before - after, np.float64)) * CELL_SIZE**2
     assert lost * GRAVEL.density / 1000.0 == pytest.approx(float(record["mass"]), rel=1e-3)
     # The map after is the sampled pile after, over the reference of the map before.
@@ -276,11 +277,11 @@ def test_what_left_the_grid_is_the_load():
 
 
 def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike():
-    first, again, other = (Rollout(3, seed, 3, Simulator()) for seed in (0, 0, 1))
+    first, again, other = (Episode(3, seed, 3, Simulator()) for seed in (0, 0, 1))
     assert first.noise_seed == again.noise_seed != other.noise_seed
     np.testing.assert_array_equal(first.action, again.action)
     assert not np.any(first.place == other.place)
-    headings = np.concatenate([Rollout(n, 0, 3, Simulator()).turn for n in range(60)])
+    headings = np.concatenate([Episode(n, 0, 3, Simulator()).turn for n in range(60)])
     assert np.abs(headings).max() <= math.radians(10.0)
     assert headings.std() == pytest.approx(math.radians(20.0) / math.sqrt(12.0), rel=0.1)
 
@@ -289,10 +290,10 @@ def test_a_corridor_is_dug_on_where_it_was_dug_before(worker):
     def nearest(protocol):
         """Median distance of a loading from the nearest before it."""
         finished = []
-        session, numbers = crew.Session(Simulator(), SEED, 12, 12, protocol), iter([0, 1])
-        worker.play(session, lambda: next(numbers, None), finished.append)
-        rollouts = sorted(played for played in finished if played is not None)
-        poses = [played.records["pose"][:, :2] for played in rollouts]
+        settings, numbers = CollectionSettings(Simulator(), SEED, 12, 12, protocol), iter([0, 1])
+        worker.simulate(settings, lambda: next(numbers, None), finished.append)
+        episodes = sorted(episode for episode in finished if episode is not None)
+        poses = [episode.records["pose"][:, :2] for episode in episodes]
         distances = [
             np.linalg.norm(pose[:k] - pose[k], axis=1).min() for pose in poses for k in range(1, 12)
         ]
@@ -312,13 +313,13 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(monkeypatch):
     steps, fresh, count = [], 0, 0
     for number in range(60):
         mine, papers = (
-            Rollout(number, SEED, 30, Simulator(), length=30, protocol=name)
+            Episode(number, SEED, 30, Simulator(), length=30, protocol=name)
             for name in ("slow", "paper")
         )
         mine.height, mine.origin = jnp.zeros((4, 4)), jnp.zeros(2)
         last = None
         for load in range(30):
-            _, action = mine.prepare()
+            _, action = mine.next_loading()
             assert (action >= np.float32(ACTION_LOW)).all()
             assert (action <= np.float32(ACTION_HIGH)).all()
             new = np.array_equal(action, papers.action[load])
@@ -334,7 +335,7 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(monkeypatch):
             slow = load % 4 == 1
             if slow:
                 last = action.copy()
-            mine.played.append({"action": action, "fill_time": 4.0 if slow else 3.9})
+            mine.loadings.append({"action": action, "fill_time": 4.0 if slow else 3.9})
     deviation = 4.0 * math.sqrt(0.8 * 0.2 / count)
     assert fresh / count == pytest.approx(0.2, abs=deviation)
     # Three spreads from the edges, so what is cut off there does not count.
@@ -344,14 +345,14 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(monkeypatch):
 
 
 def test_up_to_the_first_slow_loading_the_protocol_is_the_papers(worker):
-    def played(protocol):
+    def episodes(protocol):
         finished = []
-        session, numbers = crew.Session(Simulator(), SEED, 20, 20, protocol), iter([0, 1])
-        worker.play(session, lambda: next(numbers, None), finished.append)
-        return sorted(played for played in finished if played is not None)
+        settings, numbers = CollectionSettings(Simulator(), SEED, 20, 20, protocol), iter([0, 1])
+        worker.simulate(settings, lambda: next(numbers, None), finished.append)
+        return sorted(episode for episode in finished if episode is not None)
 
     followed = 0
-    for mine, papers in zip(played("slow"), played("paper"), strict=True):
+    for mine, papers in zip(episodes("slow"), episodes("paper"), strict=True):
         slow = np.flatnonzero(mine.records["fill_time"] >= protocol._SLOW_FILLING)
         first = slow[0] if len(slow) else 19
         for name in ("action", "pose", "mass"):
@@ -374,11 +375,11 @@ def test_a_protocol_is_part_of_what_a_data_set_is(copy):
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30, 31, 47, 449, 451, 1801, 10_718, 10_800])
 def test_the_batches_make_up_the_cycles(cycles, monkeypatch):
     for name, value in (("LOADS", 30), ("_BATCH", 60)):
-        monkeypatch.setattr(protocol, name, value)
-    layout = Layout(cycles)
-    assert layout.rollouts * 30 >= cycles > (layout.rollouts - 1) * 30
-    # A batch starts with a rollout, and with a chunk.
-    assert layout.batch_cycles == cycles or layout.batch_cycles % 30 == 0
+        monkeypatch.setattr(layout, name, value)
+    whole = Layout(cycles)
+    assert whole.episodes * 30 >= cycles > (whole.episodes - 1) * 30
+    # A batch starts with an episode, and with a chunk.
+    assert whole.batch_cycles == cycles or whole.batch_cycles % 30 == 0
 
 
 def test_a_hypercube_has_one_point_in_each_slice():
@@ -468,48 +469,78 @@ def test_missing_directories_above_are_made(tmp_path):
 
 @pytest.mark.parametrize("cores", [1, 3])
 def test_the_number_of_cores_does_not_show(store, tmp_path, monkeypatch, cores):
-    monkeypatch.setattr(batches, "cores", lambda: cores)
+    monkeypatch.setattr(worker_pool, "cores", lambda: cores)
     collect(tmp_path / "data.zarr", cycles=CYCLES, seed=SEED)
     assert contents(tmp_path / "data.zarr") == contents(store)
 
 
 def test_what_goes_wrong_in_a_worker_is_not_lost(worker):
-    session = crew.Session(Simulator(), -1, 3, 3)
+    settings = CollectionSettings(Simulator(), -1, 3, 3)
     numbers = iter([0])
     with pytest.raises(RuntimeError, match="non-negative"):
-        worker.play(session, lambda: next(numbers, None), lambda _: None)
+        worker.simulate(settings, lambda: next(numbers, None), lambda _: None)
     # It is as good as before.
-    worker.play(dataclasses.replace(session, seed=0), lambda: None, lambda _: None)
+    worker.simulate(dataclasses.replace(settings, seed=0), lambda: None, lambda _: None)
 
 
 def test_the_end_of_a_worker_is_said_in_one_line(tmp_path, monkeypatch):
     workers = []
 
     @contextlib.contextmanager
-    def hired(count):
-        workers.append(crew.Worker())
+    def pool(count):
+        workers.append(WorkerProcess())
         try:
             yield workers
         finally:
-            workers[0].end()
+            workers[0].close()
 
-    def kill(layout, start, finished, progress):
+    def kill(layout, start, news, progress):
         workers[0].process.kill()
-        raise finished.get()
+        raise news.get()
 
-    monkeypatch.setattr(batches, "cores", lambda: 1)
-    monkeypatch.setattr(batches, "hired", hired)
-    monkeypatch.setattr(batches, "_in_order", kill)
+    monkeypatch.setattr(worker_pool, "cores", lambda: 1)
+    monkeypatch.setattr(worker_pool, "worker_pool", pool)
+    monkeypatch.setattr(worker_pool, "_in_order", kill)
     refused(lambda: collect(tmp_path / "data.zarr", cycles=CYCLES), "exit code -9", "goes on")
     assert "collect" not in [thread.name for thread in threading.enumerate()]
 
 
 def test_a_worker_ends_with_its_collector():
     """Whatever way that ends: all it sees is the end of its input."""
-    worker = crew.Worker()
+    worker = WorkerProcess()
     worker.process.stdin.close()
     assert worker.process.wait(timeout=300.0) == 0
     worker.process.stdout.close()
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_a_worker_imports_nothing_from_the_working_directory(tmp_path, monkeypatch, relative):
+    """Whatever lies there: modules of Python, of a dependency, of the package itself."""
+    for name in ("queue", "json", "numpy", "importlib", "encodings", "wlplan", "sitecustomize"):
+        (tmp_path / f"{name}.py").write_text("open('executed', 'w')\nraise SystemExit(3)\n")
+    monkeypatch.chdir(tmp_path)
+    if relative:  # as in `python -c`, begun in another folder
+        monkeypatch.setattr(sys, "path", ["", ".", *sys.path])
+    worker = WorkerProcess()
+    try:
+        worker.simulate(CollectionSettings(Simulator(), 0, 3, 3), lambda: None, lambda _: None)
+    finally:
+        worker.close()
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_worker_imports_from_where_its_collector_does(tmp_path, monkeypatch):
+    """Folders that were added by hand, and the very package, though another one comes first."""
+    (tmp_path / "queue.py").write_text("open('executed', 'w')\nfrom _queue import SimpleQueue\n")
+    (tmp_path / "wlplan.py").write_text("raise SystemExit(3)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    worker = WorkerProcess()
+    try:
+        worker.simulate(CollectionSettings(Simulator(), 0, 3, 3), lambda: None, lambda _: None)
+    finally:
+        worker.close()
+    assert (tmp_path / "executed").exists()
 
 
 def test_a_worker_has_the_simulator_of_its_collector():
@@ -519,8 +550,8 @@ def test_a_worker_has_the_simulator_of_its_collector():
         settings=Settings(step=0.01),
         schedule=Schedule(sweeps=(3, 4), tolerance=0.02),
     )
-    message = json.loads(json.dumps(crew.Session(other, 1, 2, 3).message()))
-    assert simulator_from(message["simulator"]) == other
+    message = json.loads(json.dumps(CollectionSettings(other, 1, 2, 3).to_json()))
+    assert simulator_from_json(message["simulator"]) == other
 
 
 def test_a_batch_that_was_half_written_is_written_again(store, copy):
@@ -612,7 +643,7 @@ def test_other_things_are_not_overwritten(tmp_path):
 @pytest.mark.parametrize("cycles", [1, 1799, 1801, 10_800, 108_001, 1_000_000])
 def test_the_shards_are_even_portions_of_whole_batches(cycles, monkeypatch):
     for name, value in (("LOADS", 30), ("_BATCH", 60)):
-        monkeypatch.setattr(protocol, name, value)
+        monkeypatch.setattr(layout, name, value)
     batches = Layout(cycles).batches
     for count in {1, min(2, batches), min(7, batches), batches}:
         parts = [Layout(cycles, (number, count)) for number in range(1, count + 1)]
@@ -818,7 +849,7 @@ def test_a_merge_that_does_not_end_leaves_nothing(longer, parts, tmp_path, monke
         merge(parts, out, progress=stop)
     assert [entry.name for entry in tmp_path.iterdir()] == ["parts"]
     # What a killed process leaves: its hidden folder, and its lock.
-    (tmp_path / ".out.zarr.new" / "mass").mkdir(parents=True)
+    (tmp_path / ".out.zarr.0123456789ab.tmp" / "mass").mkdir(parents=True)
     (tmp_path / "out.zarr.lock").write_text(f"99999999 1 {socket.gethostname()}")
     merge(parts, out)
     assert contents(out) == contents(longer)
@@ -855,14 +886,14 @@ def test_the_command_line_collects_shards_and_merges_them(shards, longer, tmp_pa
 
 # --- processes
 
-# `wlplan collect` with the short rollouts of these tests.
+# `wlplan collect` with the short episodes of these tests.
 CHILD = """
 import sys
 from wlplan import cli
-from wlplan.dataset import batches, collecting, protocol, store
-for part in (protocol, batches, collecting, store):
+from wlplan.dataset import collecting, layout, protocol, store, worker_pool
+for part in (layout, protocol, worker_pool, collecting, store):
     part.LOADS = 3
-protocol._BATCH = 2
+layout._BATCH = 2
 sys.exit(cli.main(["collect", *sys.argv[1:]]))
 """
 

@@ -306,7 +306,7 @@ def played(mass=3000.0, lost=0.05, density=GRAVEL.density, **others):
         "envelope_after": before,
         "record": np.zeros((3, len(loader.RECORDED))),
     }
-    return cycle.Played(**{**fields, **others})
+    return cycle.CycleRecord(**{**fields, **others})
 
 
 def test_what_leaves_the_map_is_the_load():

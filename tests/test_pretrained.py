@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from wlplan import cli
-from wlplan.dataset import VARIABLES, Dataset, differences, probes, probes_of
+from wlplan.dataset import VARIABLES, Dataset, probes, probes_of, simulator_changes
 from wlplan.errors import InputError
 from wlplan.models.storage import load_model, read_description
 from wlplan.terrain.automaton import relax
@@ -33,7 +33,7 @@ def test_the_shipped_weights_are_of_todays_simulator(data):
     # All models share their data, so the cycles are played once.
     assert all(other["fingerprints"] == data[0]["fingerprints"] for other in data), REBUILD
     assert all(other["probes"] == data[0]["probes"] for other in data), REBUILD
-    wrong = differences(data[0])
+    wrong = simulator_changes(data[0])
     assert not wrong, (
         f"the weights that ship were trained on cycles of another simulator than today's "
         f"({'; '.join(wrong[:3])}): {REBUILD}"
@@ -42,15 +42,19 @@ def test_the_shipped_weights_are_of_todays_simulator(data):
 
 def test_the_check_can_fail(data, monkeypatch):
     some = data[0]["probes"][:1]
-    assert not differences({**data[0], "probes": some})
+    assert not simulator_changes({**data[0], "probes": some})
     for name in ("mass", "time", "work", "moved"):
-        (found,) = differences({**data[0], "probes": [{**some[0], name: 1.01 * some[0][name]}]})
+        (found,) = simulator_changes(
+            {**data[0], "probes": [{**some[0], name: 1.01 * some[0][name]}]}
+        )
         assert name in found
     turned = [{**some[0], "characteristics": [v + 0.01 for v in some[0]["characteristics"]]}]
-    assert differences({**data[0], "probes": turned})
-    assert differences({**data[0], "probes": []}) == ["the data set had no cycles to compare with"]
+    assert simulator_changes({**data[0], "probes": turned})
+    assert simulator_changes({**data[0], "probes": []}) == [
+        "the data set had no cycles to compare with"
+    ]
     soil = {**data[0]["soil"], "friction": 0.5, "stickiness": 1.0}
-    found = differences({**data[0], "probes": some, "soil": soil})
+    found = simulator_changes({**data[0], "probes": some, "soil": soil})
     assert [entry.split()[0] for entry in found] == ["soil.friction", "soil.stickiness"]
 
 

@@ -1,14 +1,12 @@
-"""What the commands give out: folders written as a whole, JSON, tables and remarks."""
+"""What the commands give out: folders, JSON, tables and remarks."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import secrets
-import shutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,38 +40,8 @@ def checked_folder(name: str) -> Path:
     return folder
 
 
-@contextlib.contextmanager
-def staged(folder: Path) -> Iterator[Path]:
-    """A hidden folder to write to, whose files move into place once all are there.
-
-    Other files in the folder stay. If writing fails or is interrupted, the folder is as it was.
-    """
-    exists = folder.is_dir()
-    if not exists:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    # Inside or beside the folder, so that moving is renaming on one file system.
-    name = f".{folder.name or 'wlplan'}.{secrets.token_hex(6)}.tmp"
-    staging = folder / name if exists else folder.with_name(name)
-    staging.mkdir()
-    try:
-        yield staging
-        files = sorted(staging.iterdir())
-        for file in files:
-            if (folder / file.name).is_dir():
-                raise InputError(
-                    f"{folder / file.name}: is a folder where a file goes: choose another --out."
-                )
-        if exists:
-            for file in files:
-                os.replace(file, folder / file.name)
-        else:
-            os.rename(staging, folder)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-
-
 def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
-    """Write files into a folder, all or none.
+    """Write files into a folder, all or none; other files there stay.
 
     Args:
         folder: Folder, made if it is missing.
@@ -81,13 +49,14 @@ def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
 
     Raises:
         InputError: If a file cannot be written.
+        OSError: If the folder cannot.
     """
-    from wlplan.io import write_bytes_atomic
+    from wlplan.io.files import atomic_folder, write_bytes_atomic
 
-    with staged(folder) as staging:
+    with atomic_folder(folder, existing="add") as temporary:
         for name, content in contents.items():
             data = content.encode() if isinstance(content, str) else content
-            write_bytes_atomic(staging / name, data)
+            write_bytes_atomic(temporary / name, data)
 
 
 def json_text(document: Mapping[str, Any]) -> str:

@@ -34,7 +34,7 @@ from wlplan.cli.options import (
     with_options,
     world_option,
 )
-from wlplan.cli.outputs import checked_folder, json_text, remark, staged
+from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.plan_table import print_plan, remark_on_ledger
 from wlplan.cli.progress import Progress, Stopwatch, ready
 from wlplan.constants import QUANTITIES
@@ -90,6 +90,7 @@ def plan(
     site = site_named(soil, machine)
     folder = None if out is None else checked_folder(out)
 
+    from wlplan.io.files import atomic_folder
     from wlplan.planning.objective import objective_of
     from wlplan.planning.plan import plan_loads, play
     from wlplan.report.document import plan_document, violations_of, write_plan_folder
@@ -146,7 +147,7 @@ def plan(
         seconds["simulator"] = playing.text()
     written = None
     if folder is not None:
-        with staged(folder) as staging:
+        with atomic_folder(folder, existing="add") as staging:
             written = write_plan_folder(
                 staging,
                 document,
@@ -203,6 +204,7 @@ def simulate(
     folder = None if out is None else checked_folder(out)
 
     from wlplan.io import read_plan
+    from wlplan.io.files import atomic_folder
     from wlplan.planning.plan import play
     from wlplan.report.document import plan_document, write_plan_folder
 
@@ -260,7 +262,7 @@ def simulate(
     text = json_text(document)
     written = None
     if folder is not None:
-        with staged(folder) as staging:
+        with atomic_folder(folder, existing="add") as staging:
             written = write_plan_folder(
                 staging,
                 document,

@@ -1,4 +1,4 @@
-"""Collecting: play what is missing of a data set and store it."""
+"""Collecting: simulate what is missing of a data set and store it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from wlplan.dataset import store
-from wlplan.dataset.batches import batches_of
-from wlplan.dataset.crew import Session
-from wlplan.dataset.protocol import PROTOCOLS, Layout
+from wlplan.dataset.layout import Layout
+from wlplan.dataset.protocol import PROTOCOLS
 from wlplan.dataset.variables import LOADS
+from wlplan.dataset.worker_pool import CollectionSettings, collect_batches
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
 
@@ -29,9 +29,9 @@ def collect(
     simulator: Simulator = _SIMULATOR,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Plays loading cycles and stores them; goes on where an earlier call stopped.
+    """Simulates loading cycles and stores them; goes on where an earlier call stopped.
 
-    A data set of more cycles is a longer series of the same rollouts. Cycles are written batch by
+    A data set of more cycles is a longer series of the same episodes. Cycles are written batch by
     batch; what was written stays intact whatever happens to the process.
 
     A shard is a part of a data set that is collected on its own, with the same cycles as in the
@@ -40,13 +40,13 @@ def collect(
     Args:
         path: Directory of the data set, a zarr (version 3) group; by custom it ends in `.zarr`.
             Missing directories above it are made.
-        cycles: Number of loading cycles, of all shards together; the last rollout is cut short to
+        cycles: Number of loading cycles, of all shards together; the last episode is cut short to
             meet it.
         seed: Seed of piles, poses and actions.
         protocol: Where is dug, one of `PROTOCOLS`.
         shard: Which part to collect, counted from 1, and how many there are; None: everything.
         simulator: The simulator with its machine and soil.
-        progress: Called with the number of cycles played so far and in all, of the shard if it is
+        progress: Called with the number of cycles so far and in all, of the shard if it is
             one.
 
     Raises:
@@ -71,8 +71,8 @@ def collect(
             if progress is not None:
                 progress(done, layout.size)
             start = layout.first + done
-            session = Session(simulator, seed, layout.loads, LOADS, protocol)
-            with contextlib.closing(batches_of(layout, start, session, progress)) as batches:
+            settings = CollectionSettings(simulator, seed, layout.loads, LOADS, protocol)
+            with contextlib.closing(collect_batches(layout, start, settings, progress)) as batches:
                 for batch in batches:
                     store.write(path, batch, done)
                     done += len(batch["mass"])

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from wlplan.dataset import store
-from wlplan.dataset.protocol import Layout
+from wlplan.dataset.layout import Layout
 from wlplan.dataset.variables import VARIABLES
 from wlplan.errors import InputError
+from wlplan.io.files import atomic_folder
 from wlplan.io.provenance import command
 
 # Attributes that are a shard's own; in all others the shards of a data set agree.
@@ -71,7 +72,7 @@ def merge(
             if not store.is_new(path):
                 _check_is_merged(path, whole, attributes | complete)
                 return attributes | complete
-            with store.beside(path) as new:
+            with atomic_folder(path, locked=True) as new:
                 store.make_arrays(new, whole, attributes)
                 done = 0
                 if progress is not None:

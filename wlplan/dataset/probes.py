@@ -3,7 +3,7 @@
 A hash of the source would change with every comment, one of outcomes with the processor. So the
 outcomes themselves are kept, and compared within a tolerance with those of the same cycles today:
 piles, local maps, characteristics, simulator and automaton all have a say in them. They are the
-first loadings of one rollout on each seed pile, so nothing has to be kept of the pile but its
+first loadings of one episode on each seed pile, so nothing has to be kept of the pile but its
 number. What is a plain value, soil and machine among them, is compared as it is.
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array
 
 from wlplan.constants import CELL_SIZE
-from wlplan.dataset.protocol import Rollout, grid_origin
+from wlplan.dataset.protocol import Episode, grid_origin
 from wlplan.dataset.variables import Dataset
 from wlplan.engines.simulator import Simulator
 from wlplan.terrain.characteristics import as_vector, characteristics
@@ -35,10 +35,10 @@ from wlplan.terrain.heightmap import (
 from wlplan.terrain.seed_piles import SEED_PILES
 from wlplan.types import Pile, Pose, action_from
 
-# Loadings of each rollout.
+# Loadings of each episode.
 _LOADS = 5
-# Largest difference of an outcome, over the size that it usually has. Played again on the same
-# machine outcomes agree to 2e-5, in float64 to 4e-4 over whole rollouts: another instruction set
+# Largest difference of an outcome, over the size that it usually has. Simulated again on the same
+# machine outcomes agree to 2e-5, in float64 to 4e-4 over whole episodes: another instruction set
 # changes less.
 _TOLERANCE = 1e-3
 # Mass [tonne], time [s], work [kJ], volume that moved [m³], characteristics [rad, rad, 1/m, 1/m].
@@ -53,7 +53,7 @@ def probes_of(dataset: Dataset) -> list[dict[str, Any]]:
         for load in range(_LOADS):
             (where,) = np.nonzero((dataset.rollout == number) & (dataset.load == load))
             if len(where) != 1:
-                # A data set of one's own need not be made up of rollouts.
+                # A data set of one's own need not be made up of episodes.
                 return []
             k = int(where[0])
             moved = np.abs(dataset.h52_after[k] - dataset.h52[k]).sum(dtype=np.float64)
@@ -72,11 +72,14 @@ def probes_of(dataset: Dataset) -> list[dict[str, Any]]:
     return found
 
 
-def differences(data: Mapping[str, Any]) -> list[str]:
-    """What is different today from when a data set was collected, in words.
+def simulator_changes(data: Mapping[str, Any]) -> list[str]:
+    """How today's simulator differs from the one that a data set was collected with, in words.
 
     Args:
         data: Attributes of the data set and its `probes`, as the `model.json` of a model has them.
+
+    Returns:
+        A line for each setting or outcome that is another one; empty if all are the same.
     """
     simulator = Simulator()
     wrong = []
@@ -88,18 +91,18 @@ def differences(data: Mapping[str, Any]) -> list[str]:
     probes = data.get("probes")
     if not probes:
         return [*wrong, "the data set had no cycles to compare with"]
-    for probe, again in zip(probes, _played_again(probes, data["seed"], simulator), strict=True):
+    for probe, again in zip(probes, _simulated_again(probes, data["seed"], simulator), strict=True):
         for name, usual in _USUAL.items():
             off = np.abs(np.asarray(again[name]) - np.asarray(probe[name])).max() / usual
             if not off <= _TOLERANCE:
                 wrong.append(
-                    f"{name} of a cycle of rollout {probe['rollout']} was {probe[name]}, is "
+                    f"{name} of a cycle of episode {probe['rollout']} was {probe[name]}, is "
                     f"{again[name]}"
                 )
     return wrong
 
 
-def _played_again(
+def _simulated_again(
     probes: list[dict[str, Any]], seed: int, simulator: Simulator
 ) -> Iterator[dict[str, Any]]:
     """The outcomes of the same cycles in today's simulator."""
@@ -107,18 +110,18 @@ def _played_again(
     for probe in probes:
         if probe["rollout"] != number:
             number = probe["rollout"]
-            rollout = Rollout(number, seed, _LOADS, simulator)
-            rollout.heap()
-            height = rollout.height
+            episode = Episode(number, seed, _LOADS, simulator)
+            episode.reset()
+            height = episode.height
         pose, action = (jnp.asarray(probe[name], jnp.float32) for name in ("pose", "action"))
-        height, outcome = _player(simulator)(height, pose, action)
+        height, outcome = _compiled(simulator)(height, pose, action)
         yield {name: np.asarray(value, float).tolist() for name, value in outcome.items()}
 
 
 @functools.cache
-def _player(simulator: Simulator) -> Callable[..., tuple[Array, dict[str, Array]]]:
+def _compiled(simulator: Simulator) -> Callable[..., tuple[Array, dict[str, Array]]]:
     @jax.jit
-    def play(height: Array, pose: Array, action: Array) -> tuple[Array, dict[str, Array]]:
+    def simulate(height: Array, pose: Array, action: Array) -> tuple[Array, dict[str, Array]]:
         pile, at = Pile(height, CELL_SIZE, grid_origin()), Pose(*pose)
         after, performance = simulator(pile, at, action_from(action))
         points = local_points(at, STATE_CELLS, STATE_DISPLACEMENT, height.dtype)
@@ -131,4 +134,4 @@ def _player(simulator: Simulator) -> Callable[..., tuple[Array, dict[str, Array]
             "characteristics": as_vector(characteristics(sample_local(pile, at))),
         }
 
-    return play
+    return simulate

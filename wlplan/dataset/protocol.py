@@ -1,4 +1,8 @@
-"""Protocols: which piles are dug where, with which actions, and what is recorded."""
+"""Protocols: which piles are dug where, with which actions, and what is recorded.
+
+An `Episode` is one pile with all that is random about digging it. In a data set the variable
+`rollout` holds its number.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +27,6 @@ from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
 from wlplan.terrain.toe import toe_contour
 from wlplan.types import Pile
 
-# Rollouts that are written as one batch: one chunk of every variable, 19 MB of the largest.
-_BATCH = 60
 # Largest deviation of the heading from the normal of the toe [rad]. Paper, section 6.2.
 _HEADING_SPREAD = math.radians(10.0)
 # What the random streams are for; part of their keys.
@@ -37,88 +39,21 @@ _STAY, _NEAR = 0.85, 0.5
 _SLOW_FILLING, _REPEAT, _SIMILAR = 4.0, 0.8, 0.1
 
 PROTOCOLS = ("paper", "corridor", "slow")
-"""How a rollout goes on. "paper": anywhere along the toe with any action, as in section 6.2.
+"""How an episode goes on. "paper": anywhere along the toe with any action, as in section 6.2.
 "corridor": mostly near where it dug before, as plans do: so corridors come about, and what stands
 between them. "slow": anywhere, mostly with an action like that of the last slow filling: so there
 are far more loadings that stall, or nearly do, than the paper's few in a hundred."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Layout:
-    """How many cycles are rolled out in which portions, and which part of them is meant.
-
-    Attributes:
-        cycles: Number of cycles of the whole collection.
-        shard: Which part is meant, counted from 1, and how many there are; None: the whole.
-
-    Raises:
-        InputError: If there are no cycles, there is no such part, or parts would be empty.
-    """
-
-    cycles: int
-    shard: tuple[int, int] | None = None
-
-    def __post_init__(self) -> None:
-        if self.cycles < 1:
-            raise InputError(f"{self.cycles} cycles asked for: it has to be at least 1.")
-        number, count = self.shard or (1, 1)
-        if not 1 <= number <= count:
-            raise InputError(
-                f"There is no shard {number}/{count}: give 1/{count} to {count}/{count}."
-            )
-        if count > self.batches:
-            raise InputError(
-                f"{self.cycles} cycles cannot be cut into {count} shards: a shard holds whole "
-                f"batches of {self.batch_cycles} cycles, so at most {self.batches} make sense."
-            )
-
-    @property
-    def rollouts(self) -> int:
-        """Rollouts of the whole, the last perhaps in part."""
-        return math.ceil(self.cycles / LOADS)
-
-    @property
-    def loads(self) -> int:
-        """Loadings to play of each rollout."""
-        return min(LOADS, self.cycles)
-
-    @property
-    def batch_cycles(self) -> int:
-        """Cycles that are written at once."""
-        return min(_BATCH * LOADS, self.cycles)
-
-    @property
-    def batches(self) -> int:
-        """Batches of the whole, the last perhaps in part."""
-        return math.ceil(self.cycles / self.batch_cycles)
-
-    @property
-    def first(self) -> int:
-        """First cycle of the part, counted from 0 in the whole."""
-        number, count = self.shard or (1, 1)
-        return (number - 1) * self.batches // count * self.batch_cycles
-
-    @property
-    def stop(self) -> int:
-        """The cycle after the last of the part."""
-        number, count = self.shard or (1, 1)
-        return min(number * self.batches // count * self.batch_cycles, self.cycles)
-
-    @property
-    def size(self) -> int:
-        """Number of cycles in the part."""
-        return self.stop - self.first
-
-
-class Rollout:
+class Episode:
     """A pile, what is random about digging it, and the loadings so far.
 
     Args:
-        number: Number of the rollout; it tells which seed pile.
+        number: Number of the episode, which also decides its seed pile.
         seed: Seed of piles, poses and actions.
-        loads: Loadings to play.
+        loads: Loadings to simulate.
         simulator: The simulator.
-        length: Loadings of a whole rollout; None: `LOADS`.
+        length: Loadings of a whole episode; None: `LOADS`.
         protocol: One of `PROTOCOLS`.
     """
 
@@ -165,23 +100,26 @@ class Rollout:
         self.simulator = simulator
         self.pose = np.zeros(3, np.float32)
         self.valid = False
-        self.played: list[dict[str, Any]] = []
+        self.loadings: list[dict[str, Any]] = []
 
-    def heap(self) -> None:
-        """Makes the pile; apart from the random numbers, for it takes time."""
+    def reset(self) -> None:
+        """Makes the pile before the first loading: `height` [m], [nx, ny], and `origin` [m], [2].
+
+        Not part of the construction, since it takes time.
+        """
         shape = grid_shape()
         kind, slope = SEED_PILES[self.seed_pile]
         pile = seed_pile(kind, slope=slope, seed=self.noise_seed)
-        self.height = relaxer(self.simulator.soil.repose_angle)(_on_grid(pile, shape)).height
+        self.height = compiled_relax(self.simulator.soil.repose_angle)(_on_grid(pile, shape)).height
         self.origin = grid_origin()
 
     @property
     def load(self) -> int:
         """Number of the next loading."""
-        return len(self.played)
+        return len(self.loadings)
 
-    def prepare(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pose and action of the next loading."""
+    def next_loading(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pose x, y [m], heading [rad], shape [3], and action, shape [4], of the next loading."""
         pile = Pile(self.height, CELL_SIZE, self.origin)
         shift = self.shift[self.load]
         near = None if np.isnan(shift).any() else self.pose[:2] + shift
@@ -191,17 +129,22 @@ class Rollout:
         self.pose = self.pose if pose is None else pose
         variation = self.variation[self.load]
         if not np.isnan(variation).any():
-            slow = [load["action"] for load in self.played if load["fill_time"] >= _SLOW_FILLING]
+            slow = [load["action"] for load in self.loadings if load["fill_time"] >= _SLOW_FILLING]
             if slow:
                 low, high = np.array(ACTION_LOW), np.array(ACTION_HIGH)
                 similar = np.clip(slow[-1] + (high - low) * variation, low, high)
                 self.action[self.load] = similar.astype(np.float32)
         return self.pose, self.action[self.load]
 
-    def take_in(self, height: Array, record: dict[str, Any]) -> None:
-        """The surface after the loading and its simulated variables."""
+    def add_loading(self, height: Array, outcome: dict[str, Any]) -> None:
+        """Records the loading that `next_loading` gave.
+
+        Args:
+            height: The surface after it [m], shape [nx, ny].
+            outcome: Its simulated variables by name, see `VARIABLES`.
+        """
         self.height = height
-        maps = (record[name] for name in ("h36", "h52", "h52_after"))
+        maps = (outcome[name] for name in ("h36", "h52", "h52_after"))
         known = {
             "h36_after": h36_after(*maps),
             "action": self.action[self.load],
@@ -211,12 +154,12 @@ class Rollout:
             "seed_pile": self.seed_pile,
             "load": self.load,
         }
-        self.played.append(record | known)
+        self.loadings.append(outcome | known)
 
     def records(self) -> dict[str, np.ndarray]:
-        """The variables of all loadings."""
+        """The variables of all loadings so far, see `VARIABLES`; the first axis is the loading."""
         return {
-            name: np.stack([load[name] for load in self.played]).astype(variable.dtype)
+            name: np.stack([load[name] for load in self.loadings]).astype(variable.dtype)
             for name, variable in VARIABLES.items()
         }
 
@@ -274,7 +217,7 @@ def _on_grid(pile: Pile, shape: tuple[int, int]) -> Pile:
 
 
 @functools.cache
-def relaxer(repose_angle: float) -> Callable[[Pile], Pile]:
+def compiled_relax(repose_angle: float) -> Callable[[Pile], Pile]:
     """`relax` for an angle of repose [rad], compiled."""
     # One pile at a time, since `relax` stops as soon as the pile stands.
     return jax.jit(functools.partial(relax, repose_angle=repose_angle))

@@ -7,7 +7,6 @@ import dataclasses
 import itertools
 import json
 import os
-import shutil
 import socket
 import time
 import warnings
@@ -17,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from wlplan.dataset.protocol import Layout
+from wlplan.dataset.layout import Layout
 from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, h36_after
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
+from wlplan.io.files import atomic_folder, replace_file
 from wlplan.io.provenance import command, versions
 
 DATASET_FORMAT = "wlplan.dataset/1"
@@ -58,24 +58,8 @@ def is_new(path: Path) -> bool:
     return not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir()))
 
 
-@contextlib.contextmanager
-def beside(path: Path) -> Iterator[Path]:
-    """A hidden place beside a path to write to; what is there moves to the path in one step.
-
-    Nothing is left of it if the block fails. What a killed process left there is removed first.
-    """
-    beside = path.with_name(f".{path.name}.new")
-    shutil.rmtree(beside, ignore_errors=True)
-    try:
-        yield beside
-        os.replace(beside, path)
-    except BaseException:
-        shutil.rmtree(beside, ignore_errors=True)
-        raise
-
-
 def create(path: Path, layout: Layout, identity: Mapping[str, Any]) -> None:
-    """Makes a data set without cycles, all of it or nothing."""
+    """Makes a data set without cycles, all of it or nothing; the caller holds its `lock`."""
     attributes = {
         **identity,
         "title": "Loading cycles of a simulated wheel loader",
@@ -83,7 +67,7 @@ def create(path: Path, layout: Layout, identity: Mapping[str, Any]) -> None:
         "versions": versions(),
         "cycles_done": 0,
     }
-    with beside(path) as new:
+    with atomic_folder(path, locked=True) as new:
         make_arrays(new, layout, attributes)
 
 
@@ -142,8 +126,9 @@ def resume(path: Path, wanted: Mapping[str, Any]) -> int:
             f"with that one, or choose another place."
         )
     # A process that was killed while it wrote leaves files that were never finished.
-    for partial_file in path.glob("**/*.partial"):
-        partial_file.unlink(missing_ok=True)
+    for pattern in ("**/*.partial", ".zarr.json.*.tmp"):
+        for partial_file in path.glob(pattern):
+            partial_file.unlink(missing_ok=True)
     return done
 
 
@@ -213,12 +198,7 @@ def update_attributes(path: Path, changes: Mapping[str, Any]) -> None:
     target = path / "zarr.json"
     document = json.loads(target.read_text("utf-8"))
     document["attributes"].update(changes)
-    beside = path / ".zarr.json.partial"
-    with beside.open("w", encoding="utf-8") as file:
-        json.dump(document, file, indent=2)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(beside, target)
+    replace_file(target, json.dumps(document, indent=2).encode())
 
 
 @contextlib.contextmanager

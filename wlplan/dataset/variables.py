@@ -24,7 +24,7 @@ from wlplan.terrain.seed_piles import SEED_PILES
 from wlplan.types import Action, Characteristics, Pose
 
 LOADS = 30
-"""Consecutive loadings of a rollout. Paper, section 6.2."""
+"""Consecutive loadings of an episode. Paper, section 6.2."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,7 +146,7 @@ class Dataset:
 
 
 def join(datasets: Sequence[Dataset]) -> Dataset:
-    """Data sets in a row, their rollouts numbered on; the attributes are those of the first.
+    """Data sets in a row, their episodes numbered on; the attributes are those of the first.
 
     Raises:
         InputError: If they are of different soils or machines.
@@ -181,9 +181,9 @@ def fingerprint(dataset: Dataset) -> str:
 def split(
     dataset: Dataset, *, seed: int = 0, fractions: tuple[float, ...] = (0.8, 0.1, 0.1)
 ) -> tuple[Dataset, ...]:
-    """Splits a data set at random into parts that share no rollout.
+    """Splits a data set at random into parts that share no episode, the variable `rollout`.
 
-    Cycles of one rollout resemble each other: they dig the same pile. Split by cycle, a test set
+    Cycles of one episode resemble each other: they dig the same pile. Split by cycle, a test set
     would not tell how a model does on a pile that it has not seen.
 
     Args:
@@ -192,20 +192,20 @@ def split(
         fractions: Size of each part over their sum; by default training, validation and test.
 
     Raises:
-        InputError: If there are fewer rollouts than parts.
+        InputError: If there are fewer episodes than parts.
     """
     if not fractions or min(fractions) <= 0.0 or not math.isfinite(sum(fractions)):
         raise InputError(f"The fractions of the split are {fractions}: they have to be positive.")
-    rollouts = np.unique(dataset.rollout)
+    episodes = np.unique(dataset.rollout)
     parts = len(fractions)
-    if len(rollouts) < parts:
+    if len(episodes) < parts:
         raise InputError(
-            f"The data set has {len(rollouts)} rollouts, too few for {parts} parts that share "
+            f"The data set has {len(episodes)} rollouts, too few for {parts} parts that share "
             f"none: collect at least {parts * LOADS} cycles."
         )
-    order = np.random.default_rng(seed).permutation(rollouts)
-    # Each part has one rollout for a start, the rest is shared out by the fractions.
-    share = np.cumsum(fractions) / sum(fractions) * (len(rollouts) - parts)
+    order = np.random.default_rng(seed).permutation(episodes)
+    # Each part has one episode for a start, the rest is shared out by the fractions.
+    share = np.cumsum(fractions) / sum(fractions) * (len(episodes) - parts)
     ends = np.rint(share).astype(int) + np.arange(1, parts + 1)
     return tuple(
         dataset.select(np.isin(dataset.rollout, chosen)) for chosen in np.split(order, ends[:-1])

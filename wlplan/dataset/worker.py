@@ -1,7 +1,7 @@
-"""A process that plays rollouts for a collector, on one core: `python -m wlplan.dataset.worker`.
+"""The worker: a process that simulates episodes for a collector, on one core.
 
-It talks in lines of JSON over its standard input and output, see `wlplan.dataset.crew`, and ends
-when its input does: so it does not outlive its collector, however that ends.
+`wlplan.dataset.worker_pool` starts it and exchanges lines of JSON with it over its standard input
+and output. It ends when its input does: so it does not outlive its collector, however that ends.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from wlplan.dataset.protocol import Rollout
-from wlplan.dataset.workbench import Bench
+from wlplan.dataset.protocol import Episode
+from wlplan.dataset.vector_simulator import VectorSimulator
 from wlplan.engines.simulator import Simulator
 from wlplan.engines.simulator.cycle import Settings
 from wlplan.site.machine import WheelLoader
@@ -28,7 +28,7 @@ from wlplan.terrain.automaton import Schedule
 
 
 def main() -> None:
-    """Plays one session after the other until the input ends."""
+    """Does one collection after the other until the input ends; never returns."""
     # Ctrl-C goes to the whole group; what it means is up to the collector.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Whatever a library prints must not mix with the messages.
@@ -38,7 +38,7 @@ def main() -> None:
 
 
 class _Worker:
-    """The sessions of a worker.
+    """The worker's end of the exchange.
 
     Args:
         source: Messages of the collector.
@@ -51,17 +51,17 @@ class _Worker:
         self.stopped = threading.Event()
 
     def run(self) -> None:
-        """Plays; ends the process when the input ends."""
+        """Simulates whatever is asked for; ends the process when the input ends."""
         threading.Thread(target=self._listen, daemon=True).start()
         while True:
-            session = self.messages.get()
+            settings = self.messages.get()
             self.stopped.clear()
             try:
-                self._play(session)
+                self._simulate(settings)
             except Exception:
-                self._tell({"error": traceback.format_exc()})
+                self._send({"error": traceback.format_exc()})
             else:
-                self._tell({"done": True})
+                self._send({"done": True})
 
     def _listen(self) -> None:
         for line in self.source:
@@ -72,38 +72,38 @@ class _Worker:
                 self.messages.put(message)
         os._exit(0)
 
-    def _tell(self, message: dict[str, Any], content: bytes = b"") -> None:
+    def _send(self, message: dict[str, Any], content: bytes = b"") -> None:
         try:
             self.target.write(json.dumps(message).encode() + b"\n" + content)
             self.target.flush()
         except OSError:
             os._exit(0)
 
-    def _play(self, session: dict[str, Any]) -> None:
-        simulator = simulator_from(session["simulator"])
+    def _simulate(self, settings: dict[str, Any]) -> None:
+        simulator = simulator_from_json(settings["simulator"])
 
-        def take() -> Rollout | None:
-            self._tell({"ask": True})
+        def next_episode() -> Episode | None:
+            self._send({"next": True})
             number = self.messages.get()["number"]
             if number is None:
                 return None
-            seed, loads = session["seed"], session["loads"]
-            rest = {name: session[name] for name in ("length", "protocol")}
-            return Rollout(number, seed, loads, simulator, **rest)
+            seed, loads = settings["seed"], settings["loads"]
+            rest = {name: settings[name] for name in ("length", "protocol")}
+            return Episode(number, seed, loads, simulator, **rest)
 
-        def put(rollout: Rollout | None) -> None:
-            if rollout is None:
-                self._tell({"played": True})
+        def report(episode: Episode | None) -> None:
+            if episode is None:
+                self._send({"loading": True})
                 return
             content = io.BytesIO()
-            np.savez(content, **rollout.records())  # type: ignore[arg-type]
-            self._tell({"rollout": rollout.number, "bytes": content.tell()}, content.getvalue())
+            np.savez(content, **episode.records())  # type: ignore[arg-type]
+            self._send({"episode": episode.number, "bytes": content.tell()}, content.getvalue())
 
-        Bench(simulator, take, put, self.stopped).run()
+        VectorSimulator(simulator, next_episode, report, self.stopped).run()
 
 
-def simulator_from(parts: dict[str, Any]) -> Simulator:
-    """The simulator whose parts are named, each with its fields, as JSON holds them."""
+def simulator_from_json(parts: dict[str, Any]) -> Simulator:
+    """The simulator of `CollectionSettings.to_json`: the fields of each of its parts."""
     schedule = parts["schedule"] | {"sweeps": tuple(parts["schedule"]["sweeps"])}
     return Simulator(
         machine=WheelLoader(**parts["machine"]),
@@ -111,7 +111,3 @@ def simulator_from(parts: dict[str, Any]) -> Simulator:
         settings=Settings(**parts["settings"]),
         schedule=Schedule(**schedule),
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,12 +1,16 @@
-"""Files: written in one piece or not at all, and what is said of those that cannot be read."""
+"""Files and folders, written in one piece or not at all; errors for files that cannot be read."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import re
 import secrets
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 from wlplan.errors import InputError
 
@@ -23,22 +27,177 @@ def write_bytes_atomic(path: str | os.PathLike[str], content: bytes) -> None:
         InputError: If the folder is missing or the file cannot be written there. The target is then
             as it was.
     """
-    path = Path(path)
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
-        try:
-            with beside.open("xb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(beside, path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                beside.unlink()
-            raise
+        replace_file(Path(path), content)
     except OSError as error:
         reason = error.strerror or one_line(error)
         raise InputError(f"{path}: cannot be written ({reason}): choose another place.") from error
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """`write_bytes_atomic` for callers that word the error themselves.
+
+    Raises:
+        OSError: If the folder is missing or the file cannot be written there.
+    """
+    temporary = _temporary(path)
+    try:
+        with temporary.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+@contextlib.contextmanager
+def atomic_folder(
+    path: str | os.PathLike[str],
+    *,
+    existing: Literal["refuse", "replace", "add"] = "refuse",
+    locked: bool = False,
+) -> Iterator[Path]:
+    """A temporary folder to write to, which becomes the folder at `path` when the block ends.
+
+    If the block fails or is interrupted, or the last step does, what is at `path` is as it was, and
+    nothing else is left. Only a process that is killed leaves its temporary folder, a hidden one
+    with a name like `.models.0123456789ab.tmp`.
+
+    Args:
+        path: Folder to write. Missing folders above it are made. Of a symbolic link to a folder,
+            that folder is meant.
+        existing: What is done if there is a folder already:
+            "refuse": nothing, an error is raised, unless it is empty;
+            "replace": the new folder takes its place in one step, and the old one is removed;
+            "add": the new files are moved into it one by one, over files of the same name; all
+            other files stay, and if a move fails the earlier ones are undone.
+        locked: The caller keeps other processes from writing to `path`. Temporary folders that
+            killed ones left are then removed first.
+
+    Yields:
+        An empty folder on the file system of `path`.
+
+    Raises:
+        FileExistsError: If there is a file at `path`, or a folder that is refused.
+        IsADirectoryError: If there is a folder where a new file goes.
+        OSError: If `path` cannot be written.
+    """
+    place = Path(os.path.realpath(path))
+    if place.exists() and not place.is_dir():
+        raise FileExistsError(errno.EEXIST, "a file is there", str(path))
+    adds = existing == "add" and place.is_dir()
+    if existing == "refuse" and place.is_dir() and any(place.iterdir()):
+        raise FileExistsError(errno.EEXIST, "the folder is there and not empty", str(path))
+    if locked:
+        _remove_leftovers(place)
+    made: list[Path] = []
+    try:
+        _make_parents(place, made)
+        # Files are added from inside the folder: it may be all that can be written to.
+        temporary = _temporary(place / place.name if adds else place)
+        try:
+            temporary.mkdir()
+            yield temporary
+            if adds:
+                _move_files(temporary, place)
+            elif existing == "replace" and place.is_dir():
+                _replace_folder(place, temporary)
+            else:
+                os.replace(temporary, place)
+        finally:
+            _remove_folder(temporary)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for folder in reversed(made):
+                folder.rmdir()
+        raise
+
+
+def _make_parents(place: Path, made: list[Path]) -> None:
+    """Make the missing folders above a place, listed in `made` from the outermost on."""
+    missing = [folder for folder in place.parents if not folder.exists()]
+    for folder in reversed(missing):
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir()
+            made.append(folder)
+
+
+def _move_files(source: Path, target: Path) -> None:
+    """Move all entries of a folder into another one: all, or none."""
+    entries = sorted(source.iterdir())
+    for entry in entries:
+        if (target / entry.name).is_dir():
+            raise IsADirectoryError(
+                errno.EISDIR, "a folder is where a file goes", str(target / entry.name)
+            )
+    earlier = source / f".{secrets.token_hex(6)}.earlier"
+    earlier.mkdir()
+    begun: list[Path] = []
+    try:
+        for entry in entries:
+            begun.append(entry)
+            goal = target / entry.name
+            if os.path.lexists(goal):
+                _set_aside(goal, earlier / entry.name)
+            os.replace(entry, goal)
+    except BaseException:
+        for entry in reversed(begun):
+            goal, kept = target / entry.name, earlier / entry.name
+            if os.path.lexists(kept):
+                os.replace(kept, goal)
+            elif not os.path.lexists(entry):
+                os.replace(goal, entry)
+        raise
+
+
+def _set_aside(path: Path, aside: Path) -> None:
+    """Give a file a second name; where the file system has no such names, only that one."""
+    try:
+        os.link(path, aside, follow_symlinks=False)
+    except (OSError, NotImplementedError):
+        os.replace(path, aside)
+
+
+def _replace_folder(place: Path, new: Path) -> None:
+    """Put a new folder in the place of an old one, which is restored if that fails."""
+    old = new.with_suffix(".old")
+    try:
+        os.replace(place, old)
+        os.replace(new, place)
+    except BaseException:
+        if old.exists():
+            if not new.exists():
+                os.replace(place, new)
+            os.replace(old, place)
+        raise
+    _remove_folder(old)
+
+
+def _remove_folder(folder: Path) -> None:
+    """Remove a folder with all it holds, as far as possible; an interrupt does not stop that."""
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def _temporary(path: Path) -> Path:
+    """A hidden name beside a path that nothing has yet."""
+    return path.parent / f".{path.name or 'wlplan'}.{secrets.token_hex(6)}.tmp"
+
+
+def _remove_leftovers(place: Path) -> None:
+    """Remove the temporary folders that killed processes left beside a place."""
+    pattern = re.compile(rf"\.{re.escape(place.name)}\.[0-9a-f]{{12}}\.tmp")
+    if not place.parent.is_dir():
+        return
+    for entry in list(place.parent.iterdir()):
+        if pattern.fullmatch(entry.name) and entry.is_dir():
+            _remove_folder(entry)
 
 
 def check_is_file(path: Path, what: str) -> None:

@@ -10,8 +10,6 @@ import contextlib
 import hashlib
 import json
 import os
-import secrets
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +20,7 @@ import numpy as np
 from flax import nnx
 
 from wlplan.errors import InputError
+from wlplan.io.files import atomic_folder
 from wlplan.io.provenance import command, versions
 from wlplan.models.ensemble import Ensemble, members_of
 from wlplan.models.grid import GRID
@@ -118,17 +117,13 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
     network = nnx.merge(member.graph, member.params)
     # Arrays of the host: the checkpoint then holds no devices, and loads on any.
     weights = jax.tree.map(np.asarray, nnx.to_pure_dict(member.params))
-    token = secrets.token_hex(4)
-    beside = directory.with_name(f".{directory.name}.{token}.tmp").absolute()
-    old = directory.with_name(f".{directory.name}.{token}.old")
     try:
-        try:
-            beside.mkdir(parents=True)
+        with atomic_folder(directory, existing="replace") as new:
             with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
-                checkpointer.save(beside / _WEIGHTS, args=ocp.args.PyTreeSave(weights))
+                checkpointer.save(new / _WEIGHTS, args=ocp.args.PyTreeSave(weights))
             # Names the directory it was made in, and nothing reads it on a file system that
             # renames in one step.
-            (beside / _WEIGHTS / "commit_success.txt").unlink(missing_ok=True)
+            (new / _WEIGHTS / "commit_success.txt").unlink(missing_ok=True)
             description = {
                 "format": MODEL_FORMAT,
                 "kind": kind,
@@ -142,20 +137,10 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
                 "command": command(),
                 "versions": versions(),
                 **meta,
-                "files": _digests(beside / _WEIGHTS),
+                "files": _digests(new / _WEIGHTS),
             }
             text = json.dumps(description, indent=2, allow_nan=False) + "\n"
-            (beside / _DESCRIPTION).write_text(text, "utf-8")
-            if directory.exists():
-                os.replace(directory, old)
-            os.replace(beside, directory)
-        except BaseException:
-            if old.exists() and not directory.exists():
-                os.replace(old, directory)
-            raise
-        finally:
-            shutil.rmtree(beside, ignore_errors=True)
-            shutil.rmtree(old, ignore_errors=True)
+            (new / _DESCRIPTION).write_text(text, "utf-8")
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise InputError(

@@ -32,7 +32,7 @@ _RECORDED_EVERY = 0.04
 
 
 @dataclasses.dataclass(frozen=True)
-class Played:
+class CycleRecord:
     """The outcome of one cycle, SI units; maps are on the grid of `columns`."""
 
     mass: float  # in the bucket [kg]
@@ -74,7 +74,7 @@ def play_cycle(
     soil: Soil,
     settings: Settings,
     walls: Walls,
-) -> Played:
+) -> CycleRecord:
     """Plays one cycle.
 
     Args:
@@ -127,7 +127,7 @@ def play_cycle(
     loader.retreat(load)
     left, left_radius = rest(after[~loaded], after_radius[~loaded], *_AFTER_DIG)
     lost = bulk * float((radius**3).sum() - (left_radius**3).sum()) - load / soil.density
-    return Played(
+    return CycleRecord(
         mass=load,
         time=loader.time,
         work_drive=loader.work_drive,
@@ -238,17 +238,17 @@ class _Rest:
         return after, after_radius
 
 
-def change_of(played: Played, density: float) -> np.ndarray:
+def change_of(cycle: CycleRecord, density: float) -> np.ndarray:
     """What a cycle changes of the column heights, so that what leaves the pile is the load [m].
 
     Spheres that flew away are put back: losses are scaled, by a factor close to one.
 
     Args:
-        played: The cycle.
+        cycle: The cycle.
         density: Bulk density [kg/m^3].
     """
-    change = played.after.astype(np.float64) - played.before
+    change = cycle.after.astype(np.float64) - cycle.before
     gain, loss = np.maximum(change, 0.0), np.maximum(-change, 0.0)
-    volume = played.mass / density / CELL_SIZE**2
+    volume = cycle.mass / density / CELL_SIZE**2
     wanted = volume + gain.sum()
     return gain - loss * (wanted / loss.sum() if loss.sum() > 0.0 else 0.0)

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from wlplan.engines.dem.cycle import Played
+from wlplan.engines.dem.cycle import CycleRecord
 from wlplan.engines.dem.grains import Settings
 from wlplan.engines.dem.packing import Walls
 from wlplan.engines.dem.worker import VERSION
@@ -49,7 +49,7 @@ spec = spec_from_file_location(
     "wlplan", {str(_PACKAGE / "__init__.py")!r}, submodule_search_locations=[{str(_PACKAGE)!r}]
 )
 sys.modules["wlplan"] = module_from_spec(spec)
-from wlplan.dem.worker import main
+from wlplan.engines.dem.worker import main
 sys.exit(main(sys.argv[1:]))
 """
 # Surfaces are rounded to this [m], so that rounding errors do not make another job of the same.
@@ -86,7 +86,7 @@ def play(
     soil: Soil,
     settings: Settings,
     walls: Walls = Walls(),  # noqa: B008 (frozen)
-) -> Played:
+) -> CycleRecord:
     """Plays one cycle in the engine, or reads it if it was played before.
 
     Args:
@@ -113,14 +113,14 @@ def play(
         "walls": dataclasses.asdict(walls),
     }
     target = cache_folder() / f"cycle-{_digest(identity, rounded, numbers)}.npz"
-    arrays = _stored(target, _fields(Played))
+    arrays = _stored(target, _fields(CycleRecord))
     if arrays is None:
         job = {**identity, "soil": dataclasses.asdict(soil), "bed": str(bed_file(settings))}
         arrays = run_job(
             job, {"surface": rounded * _ROUNDED, "action": numbers}, timeout=settings.timeout
         )
-        _keep(target, arrays, _fields(Played))
-    return Played(**{name: _plain(arrays[name]) for name in _fields(Played)})
+        _keep(target, arrays, _fields(CycleRecord))
+    return CycleRecord(**{name: _plain(arrays[name]) for name in _fields(CycleRecord)})
 
 
 def bed_file(settings: Settings) -> Path:

@@ -1,6 +1,6 @@
 """The engine's own process: a job comes as an .npz file, its result goes to another.
 
-Run by `dem.process`; by hand: `python -m wlplan.engines.dem.worker JOB.npz OUT.npz`.
+Run by `wlplan.engines.dem.process`; by hand: `python -m wlplan.engines.dem.worker JOB.npz OUT.npz`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def run(job: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, np.ndar
         arrays: For a cycle "surface" [m] and "action".
 
     Returns:
-        Arrays by name: the fields of `Bed` or of `dem.cycle.Played`.
+        Arrays by name: the fields of `Bed` or of `CycleRecord`.
     """
     settings = settings_from(job["settings"])
     keep: type[np.floating[Any]]

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 from wlplan.engines.dem import columns, process
 from wlplan.engines.dem.bed import DEPTH
-from wlplan.engines.dem.cycle import Played, change_of
+from wlplan.engines.dem.cycle import CycleRecord, change_of
 from wlplan.engines.dem.grains import Settings
 from wlplan.errors import InputError
 from wlplan.site.machine import WA320, WheelLoader
@@ -66,7 +66,9 @@ class DiscreteElements(struct.PyTreeNode):
         """
         return _view(pile, pose)
 
-    def play(self, surface: np.ndarray, action: np.ndarray, tell: Callable[[str], None]) -> Played:
+    def play(
+        self, surface: np.ndarray, action: np.ndarray, tell: Callable[[str], None]
+    ) -> CycleRecord:
         """Plays one loading in the engine.
 
         Args:
@@ -99,7 +101,7 @@ class DiscreteElements(struct.PyTreeNode):
 
     def play_load(
         self, pile: Pile, pose: Pose, action: Action, note: Callable[[str], None]
-    ) -> tuple[Pile, Performance, Played]:
+    ) -> tuple[Pile, Performance, CycleRecord]:
         """Plays one loading outside of any trace.
 
         What was played is in the cache: to go on after an interrupt, begin again.
@@ -176,11 +178,11 @@ def _leave(
     return settle_dug(pile, dug, start, repose_angle=repose_angle, schedule=schedule).pile
 
 
-def outcome_of(played: Played, world: DiscreteElements) -> tuple[np.ndarray, np.ndarray]:
+def outcome_of(cycle: CycleRecord, world: DiscreteElements) -> tuple[np.ndarray, np.ndarray]:
     """What `DiscreteElements.leave` takes of a cycle: the change, and the numbers."""
-    work = played.work_drive + played.work_boom + played.work_bucket + played.work_slip
-    numbers = [played.mass / KG_PER_TONNE, played.time, work / J_PER_KJ]
-    return change_of(played, world.soil.density), np.array(numbers)
+    work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
+    numbers = [cycle.mass / KG_PER_TONNE, cycle.time, work / J_PER_KJ]
+    return change_of(cycle, world.soil.density), np.array(numbers)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

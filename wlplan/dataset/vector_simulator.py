@@ -1,4 +1,4 @@
-"""Many cycles side by side: rollouts on a bench of slots."""
+"""The vectorised simulator: cycles of many episodes side by side, each in a slot of its own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from wlplan.constants import CELL_SIZE, J_PER_KJ
-from wlplan.dataset.protocol import Rollout
+from wlplan.dataset.protocol import Episode
 from wlplan.engines.simulator import Simulator
 from wlplan.engines.simulator.cycle import State, advance, begin, outcome
 from wlplan.terrain.characteristics import as_vector, characteristics
@@ -30,40 +30,41 @@ from wlplan.terrain.heightmap import (
 from wlplan.types import Action, LocalHeightmap, Pile, Pose
 
 # Cycles that one process computes side by side. Of half as many a time step takes 1.4 times as long
-# a cycle, of twice as many no less; more leave more idle when the last rollouts are played.
+# a cycle, of twice as many no less; more leave more idle when the last episodes end.
 _SLOTS = 32
 # Time steps after which ended cycles make room for others. A cycle takes about 170 and waits half
 # of these; more of them make fewer calls.
 _STEPS = 10
 
 
-class Bench:
-    """One process's rollouts: their cycles are computed side by side, each at its own stage.
+class VectorSimulator:
+    """Simulates episodes whose cycles are computed side by side, each at its own stage.
 
-    A cycle that has ended makes room for the next of its rollout at once, and a rollout for
-    another; so none waits for the slowest. What comes of a rollout does not depend on the others.
+    A cycle that has ended makes room for the next of its episode at once, and an episode for
+    another; so none waits for the slowest. What comes of an episode does not depend on the others.
 
     Args:
         simulator: The simulator.
-        take: Gives the next rollout; None when there are no more.
-        put: Takes None for each loading played, and each rollout when it is finished.
-        stopped: Set when the rest is no longer wanted.
+        next_episode: Returns another episode; None when there are no more.
+        report: Called with None after each loading, and with each episode when it is finished.
+        stopped: Set from another thread when the rest is no longer wanted.
     """
 
     def __init__(
         self,
         simulator: Simulator,
-        take: Callable[[], Rollout | None],
-        put: Callable[[Rollout | None], None],
+        next_episode: Callable[[], Episode | None],
+        report: Callable[[Episode | None], None],
         stopped: threading.Event,
     ):
-        self.programs, self.take, self.put, self.stopped = _programs(simulator), take, put, stopped
-        self.states = _nothing(simulator)
-        self.slots: list[Rollout | None] = [None] * _SLOTS
+        self.programs, self.stopped = _programs(simulator), stopped
+        self.next_episode, self.report = next_episode, report
+        self.states = _idle(simulator)
+        self.slots: list[Episode | None] = [None] * _SLOTS
         self.views: list[Array] = [jnp.zeros(0)] * _SLOTS
 
     def run(self) -> None:
-        """Plays rollouts until there are no more."""
+        """Simulates episodes until there are no more, or it is stopped."""
         for slot in range(_SLOTS):
             self._fill(slot)
         while any(self.slots) and not self.stopped.is_set():
@@ -73,29 +74,29 @@ class Bench:
                     self._empty(slot)
 
     def _fill(self, slot: int) -> None:
-        """Puts the next loading of a slot's rollout there, or the first of another."""
-        rollout = self.slots[slot]
-        if rollout is None:
-            rollout = self.slots[slot] = self.take()
-            if rollout is None:
+        """Puts the next loading of a slot's episode there, or the first of another."""
+        episode = self.slots[slot]
+        if episode is None:
+            episode = self.slots[slot] = self.next_episode()
+            if episode is None:
                 return
-            rollout.heap()
-        pose, action = rollout.prepare()
+            episode.reset()
+        pose, action = episode.next_loading()
         self.states, self.views[slot] = self.programs.enter(
-            self.states, slot, rollout.origin, rollout.height, pose, action
+            self.states, slot, episode.origin, episode.height, pose, action
         )
 
     def _empty(self, slot: int) -> None:
         """Writes a loading back to its pile and goes on."""
-        rollout = self.slots[slot]
-        assert rollout is not None
+        episode = self.slots[slot]
+        assert episode is not None
         height, maps, numbers = self.programs.leave(
-            self.states, slot, rollout.origin, rollout.height, rollout.pose, self.views[slot]
+            self.states, slot, episode.origin, episode.height, episode.pose, self.views[slot]
         )
-        rollout.take_in(height, jax.tree.map(np.asarray, maps) | _named(np.asarray(numbers)))
-        self.put(None)
-        if rollout.load == rollout.loads:
-            self.put(rollout)
+        episode.add_loading(height, jax.tree.map(np.asarray, maps) | _named(np.asarray(numbers)))
+        self.report(None)
+        if episode.load == episode.loads:
+            self.report(episode)
             self.slots[slot] = None
         self._fill(slot)
 
@@ -105,14 +106,14 @@ class Bench:
 _States = tuple[Array, ...]
 
 
-def _packed(state: State) -> _States:
+def _pack(state: State) -> _States:
     leaves = jax.tree.leaves(state)
     small = [leaf.astype(jnp.float32) for leaf in leaves if leaf.ndim < 3]
     rows = jnp.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in small])
     return *(leaf for leaf in leaves if leaf.ndim == 3), rows
 
 
-def _unpacked(simulator: Simulator, states: _States) -> State:
+def _unpack(simulator: Simulator, states: _States) -> State:
     *large, rows = states
     cell = jnp.zeros((STATE_CELLS, STATE_CELLS, rows.shape[-1]), jnp.float32)
     number = cell[0, 0]
@@ -136,11 +137,11 @@ def _begin(simulator: Simulator, height: Array, action: Action) -> State:
     return begin(height, jnp.zeros_like(height), action, simulator.machine)
 
 
-def _nothing(simulator: Simulator) -> _States:
+def _idle(simulator: Simulator) -> _States:
     """A full set of slots in which nothing goes on."""
     zero = jnp.zeros(_SLOTS, jnp.float32)
     height = jnp.zeros((STATE_CELLS, STATE_CELLS, _SLOTS), jnp.float32)
-    states = _packed(_begin(simulator, height, Action(zero, zero, zero, zero)).ended())
+    states = _pack(_begin(simulator, height, Action(zero, zero, zero, zero)).ended())
     # Each an array of its own, for they are given away.
     return tuple(jnp.array(part, copy=True) for part in states)
 
@@ -148,13 +149,13 @@ def _nothing(simulator: Simulator) -> _States:
 def _advance(simulator: Simulator, states: _States) -> tuple[_States, Bool[Array, " b"]]:
     """Some time steps further, and which cycles have ended."""
     state = advance(
-        _unpacked(simulator, states),
+        _unpack(simulator, states),
         machine=simulator.machine,
         soil=simulator.soil,
         settings=simulator.settings,
         steps=_STEPS,
     )
-    return _packed(state), state.has_ended
+    return _pack(state), state.has_ended
 
 
 def _enter(
@@ -168,7 +169,7 @@ def _enter(
 ) -> tuple[_States, Float[Array, "52 52"]]:
     """The slots with a new loading in one of them, and its surface in the local frame."""
     view, _ = simulator.view(Pile(height, CELL_SIZE, origin), Pose(*pose))
-    one = _packed(_begin(simulator, view[..., None], Action(*(part[None] for part in action))))
+    one = _pack(_begin(simulator, view[..., None], Action(*(part[None] for part in action))))
     entered = (all_.at[..., slot].set(new[..., 0]) for all_, new in zip(states, one, strict=True))
     return tuple(entered), view
 
@@ -183,7 +184,7 @@ def _leave(
     view: Float[Array, "52 52"],
 ) -> tuple[Float[Array, "nx ny"], dict[str, Array], Float[Array, " k"]]:
     """The surface after the loading of one slot, the local maps, and the numbers of `_named`."""
-    one = _unpacked(simulator, tuple(part[..., slot][..., None] for part in states))
+    one = _unpack(simulator, tuple(part[..., slot][..., None] for part in states))
     cycles = outcome(one, machine=simulator.machine, soil=simulator.soil)
     cycle = jax.tree.map(lambda part: part[..., 0], cycles)
     pile, dig_pose = Pile(height, CELL_SIZE, origin), Pose(*pose)
