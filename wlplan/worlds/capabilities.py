@@ -5,7 +5,8 @@ more, where there is more to say:
 
 * `differentiable`: True or False. A function that says nothing is differentiated when a planner
   asks for it, and refused if that fails.
-* `uncertainty(pile, pose, action)`: standard deviation of the error of the performance.
+* `has_uncertainty`: whether `uncertainty(pile, pose, action)` gives the standard deviation of the
+  error of the performance.
 * `solve(pile, pose, action)`: as by calling it, with a `SolveReport` besides.
 * `with_derivatives()`: the same world in the form that has derivatives.
 * `play_load(pile, pose, action, note)`: plays one loading outside of any trace and returns pile,
@@ -20,6 +21,7 @@ from typing import Any, no_type_check
 import jax
 from flax import struct
 
+from wlplan.errors import InputError
 from wlplan.types import Action, Performance, Pile, Pose, World
 
 
@@ -29,21 +31,47 @@ class FunctionWorld(struct.PyTreeNode):
 
     function: Callable[..., Any] = struct.field(pytree_node=False)
     differentiable: bool | None = struct.field(pytree_node=False, default=None)  # None: not said
+    deviation: Callable[..., Any] | None = struct.field(pytree_node=False, default=None)
 
     def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         """The pile and the performance after one loading."""
         return self.function(pile, pose, action)
 
+    @property
+    def has_uncertainty(self) -> bool:
+        """Whether it says how far its performance may be off."""
+        return self.deviation is not None
 
-def world(function: Callable[..., Any], *, differentiable: bool = True) -> FunctionWorld:
+    def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
+        """Standard deviation of the error of the performance [tonne, s, kJ].
+
+        Raises:
+            InputError: If the world has none.
+        """
+        if self.deviation is None:
+            raise InputError(
+                "this world has no uncertainty: give one by wlplan.world(function, "
+                "uncertainty=...)."
+            )
+        return self.deviation(pile, pose, action)
+
+
+def world(
+    function: Callable[..., Any],
+    *,
+    differentiable: bool = True,
+    uncertainty: Callable[..., Any] | None = None,
+) -> FunctionWorld:
     """A function as a world that says what it can do.
 
     Args:
         function: `function(pile, pose, action) -> (pile_after, performance)`. One that calls out
             of JAX, for instance by `jax.pure_callback`, has no derivative.
         differentiable: Whether it passes reverse mode.
+        uncertainty: `uncertainty(pile, pose, action) -> Performance`, the standard deviation of
+            the error of its performance; None: it does not know.
     """
-    return FunctionWorld(function, differentiable)
+    return FunctionWorld(function, differentiable, uncertainty)
 
 
 def as_pytree(world: World) -> World:

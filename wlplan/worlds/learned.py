@@ -63,6 +63,11 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
         """The same, and how the solvers ended."""
         return _solve(self, pile, pose, action)
 
+    @property
+    def has_uncertainty(self) -> bool:
+        """Whether ψ says how far it may be off: an ensemble does."""
+        return hasattr(self.performance, "with_deviation")
+
     def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
         """Standard deviation of the error of the predicted performance [tonne, s, kJ].
 
@@ -72,7 +77,7 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
         Raises:
             InputError: If ψ is no ensemble.
         """
-        if not hasattr(self.performance, "with_deviation"):
+        if not self.has_uncertainty:
             raise InputError(
                 "the model of this world is a single one and has no uncertainty: train an ensemble "
                 "with `wlplan train --members 5`."
