@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from wlplan import cli, dataset, io, training
+from wlplan import cli, dataset, io
 from wlplan.errors import InputError
 from wlplan.planning import objective
 from wlplan.planning import plan as planner

@@ -31,10 +31,10 @@ class Setting:
     """
 
     help: str
-    least: float | None = None
-    above: float | None = None
-    most: float | None = None
-    below: float | None = None
+    least: int | float | None = None
+    above: int | float | None = None
+    most: int | float | None = None
+    below: int | float | None = None
     choices: tuple[str, ...] = ()
     entries: int = 1  # most entries of a tuple
 
