@@ -64,7 +64,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
             },
         }
     low, high = (np.array(rows[f"psi_{k}, swish"]["every"]["each"]) for k in ("low", "high"))
-    told = 1.0 - high.mean(axis=0) / low.mean(axis=0)
+    less = 1.0 - high.mean(axis=0) / low.mean(axis=0)
     paper = {
         name: PERFORMANCE[settings.kind, settings.activation]._asdict()
         for name, settings in PSI.items()
@@ -74,7 +74,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
         "loaded_from_t": report.loaded_mass,
         "models": rows,
         "paper": paper,
-        "less_error_with_the_map": dict(zip(NAMES, told.tolist(), strict=True)),
+        "less_error_with_the_map": dict(zip(NAMES, less.tolist(), strict=True)),
     }
 
 

@@ -82,7 +82,7 @@ def test_an_architecture_without_sense_is_refused(settings):
 
 def test_a_batch_equals_its_members(model):
     characteristics, action = inputs_of(7)
-    batch = jax.jit(jax.vmap(model))(characteristics, action)
+    batch = jax.jit(jax.vmap(model.of_view))(characteristics, action)
     single = [model.of_view(c, a) for c, a in zip(characteristics, action, strict=True)]
     np.testing.assert_allclose(
         as_rows(batch), np.stack([as_rows(p) for p in single]), rtol=2e-5, atol=1e-4
