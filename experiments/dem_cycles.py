@@ -23,7 +23,7 @@ from experiments.dem_reference import MACHINE
 from wlplan.constants import ACTION_HIGH, ACTION_LOW, J_PER_KJ, KG_PER_TONNE
 from wlplan.engines.dem import columns, process
 from wlplan.engines.dem.cycle import CycleRecord
-from wlplan.engines.dem.grains import Settings
+from wlplan.engines.dem.grains import DemSettings
 from wlplan.engines.dem.loader import RECORDED
 from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic
@@ -252,7 +252,7 @@ def collect(path: Path, *, seed: int, cycles: int, repeats: int, machine: str) -
     for number in range(begun, cycles):
         surface, action, packing, origin = next_cycle(seed, number, repeats, rows)
         played = process.play(
-            surface, action, machine=digs, soil=GRAVEL, settings=Settings(packing=packing)
+            surface, action, machine=digs, soil=GRAVEL, settings=DemSettings(packing=packing)
         )
         rows.append(row_of(played, action, origin))
         write_rows(path, rows, recipe)

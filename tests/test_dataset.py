@@ -9,6 +9,7 @@ import itertools
 import json
 import math
 import os
+import queue
 import shutil
 import signal
 import socket
@@ -517,7 +518,7 @@ def test_a_worker_ends_with_its_collector():
 def test_a_worker_imports_nothing_from_the_working_directory(tmp_path, monkeypatch, relative):
     """Whatever lies there: modules of Python, of a dependency, of the package itself."""
     for name in ("queue", "json", "numpy", "importlib", "encodings", "wlplan", "sitecustomize"):
-        (tmp_path / f"{name}.py").write_text("open('executed', 'w')\nraise SystemExit(3)\n")
+        (tmp_path / f"{name}.py").write_text("open('executed', 'w').close()\nraise SystemExit(3)\n")
     monkeypatch.chdir(tmp_path)
     if relative:  # as in `python -c`, begun in another folder
         monkeypatch.setattr(sys, "path", ["", ".", *sys.path])
@@ -531,7 +532,9 @@ def test_a_worker_imports_nothing_from_the_working_directory(tmp_path, monkeypat
 
 def test_a_worker_imports_from_where_its_collector_does(tmp_path, monkeypatch):
     """Folders that were added by hand, and the very package, though another one comes first."""
-    (tmp_path / "queue.py").write_text("open('executed', 'w')\nfrom _queue import SimpleQueue\n")
+    (tmp_path / "queue.py").write_text(
+        f"open('executed', 'w').close()\nexec(open({queue.__file__!r}).read())\n"
+    )
     (tmp_path / "wlplan.py").write_text("raise SystemExit(3)\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)

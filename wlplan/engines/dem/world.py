@@ -18,7 +18,7 @@ from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 from wlplan.engines.dem import columns, process
 from wlplan.engines.dem.bed import DEPTH
 from wlplan.engines.dem.cycle import CycleRecord, change_of
-from wlplan.engines.dem.grains import Settings
+from wlplan.engines.dem.grains import DemSettings
 from wlplan.errors import InputError
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, Soil
@@ -43,7 +43,7 @@ class DiscreteElements(struct.PyTreeNode):
 
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
-    settings: Settings = struct.field(pytree_node=False, default=Settings())
+    settings: DemSettings = struct.field(pytree_node=False, default=DemSettings())
     schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
 
     differentiable = False
