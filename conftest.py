@@ -1,8 +1,8 @@
 """The code blocks of README and docs/ are tests: `make test-slow` runs them.
 
 Python blocks run, one after the other in one namespace a page. Shell blocks are not run, for some
-would take hours: every `wlplan` command has to parse, every target of make and every extra of pip has
-to exist. TOML blocks are read as what their first line calls them.
+would take hours: every `wlplan` command has to parse, every target of make and every extra of pip
+has to exist. TOML blocks are read as what their first line calls them.
 """
 
 from __future__ import annotations
