@@ -14,7 +14,7 @@ class PileStatePredictor(Protocol):
     """φ: how a loading changes the local heightmap.
 
     Attributes:
-        conserves_volume: Whether exactly the volume that it is told leaves the map. If not, it
+        conserves_volume: Whether exactly the volume that it is given leaves the map. If not, it
             ignores volume and floor, and what leaves is its own prediction.
     """
 
