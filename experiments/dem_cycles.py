@@ -274,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--repeats",
         type=int,
         default=0,
-        help="packings in which each pile and action is played, in place of two loadings a pile",
+        help="packings in which each pile and action is played, instead of two loadings a pile",
     )
     parser.add_argument("--machine", choices=MACHINES, default="reference", help="what digs")
     options = parser.parse_args(arguments)

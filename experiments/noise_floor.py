@@ -52,7 +52,7 @@ MODELS = ("psi_low, swish", "psi_high, swish")
 SHAPE = (STATE_CELLS, STATE_CELLS)
 # More neighbours than these are not looked at in vain: some cycles are not valid.
 INVALID = 30
-# Kinds that are floors of one of the models, by what it is not told.
+# Kinds that are floors of one of the models, by what it does not see.
 COMPARED = ("around the map", "same characteristics")
 # Below this height over the floor a change fades out: level ground stays level [m].
 FADE = 0.1

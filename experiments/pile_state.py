@@ -1,7 +1,7 @@
 """Pile state predictors on held-out cycles: the paper's, as described, and ours, on one split.
 
 Paper, table 2 and figures 11 and 12: the volume between predicted and simulated surface, with and
-without the paper's post-processing, how it is spread, and five samples. Ours is told the simulated
+without the paper's post-processing, how it is spread, and five samples. Ours is given the simulated
 load, as `wlplan evaluate` does; the paper's predicts the map alone.
 """
 
@@ -32,7 +32,7 @@ from wlplan.training.pile_state import misplaced_volume, pile_state_errors, pred
 from wlplan.types import LocalHeightmap
 from wlplan.worlds.library import pretrained_path
 
-# Trainings of ours; of the paper's, which takes a quarter of an hour, one.
+# Trainings of our φ; of the paper's, which takes a quarter of an hour, one.
 SEEDS = 5
 PLAIN, BLENDED = "paper's φ, as predicted", "paper's φ, edges blended"
 OURS, SHIPS = "ours", "ours, as it ships"

@@ -1,4 +1,4 @@
-"""How well the ensembles that ship predict the deviation of their error, on cycles new to them.
+"""How well the ensembles that ship know their own errors, on cycles new to them.
 
 The first row: of the cycles, how many lie inside an interval, over how many should. The second: the
 cycles sorted by the deviation that was predicted, and what they were off.

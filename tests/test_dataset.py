@@ -502,7 +502,7 @@ def test_the_end_of_a_worker_is_said_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(worker_pool, "cores", lambda: 1)
     monkeypatch.setattr(worker_pool, "worker_pool", pool)
     monkeypatch.setattr(worker_pool, "_in_order", kill)
-    refused(lambda: collect(tmp_path / "data.zarr", cycles=CYCLES), "exit code -9", "goes on")
+    refused(lambda: collect(tmp_path / "data.zarr", cycles=CYCLES), "exit code -9", "continues")
     assert "collect" not in [thread.name for thread in threading.enumerate()]
 
 

@@ -182,7 +182,7 @@ def test_what_was_trained_and_what_was_kept_is_told(tmp_path, monkeypatch, capsy
     assert time.startswith("collecting and training")
     assert written == f"written: {tmp_path / 'psi_high'}"
     others = f"{tmp_path / 'phi'}, {tmp_path / 'psi_low'}"
-    assert kept == f"kept, being of the same data, settings and versions: {others}"
+    assert kept == f"kept, since data, settings and versions are the same: {others}"
 
 
 def test_every_model_that_a_world_needs_is_trained():

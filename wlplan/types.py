@@ -169,7 +169,7 @@ class LocalHeightmap(struct.PyTreeNode):
 class SolveReport(struct.PyTreeNode):
     """How the solvers of a loading ended; every leaf is a scalar, or has the loadings as its axis.
 
-    A world that solves for the pile after a loading tells it by `solve(pile, pose, action) ->
+    A world that solves for the pile after a loading reports this by `solve(pile, pose, action) ->
     (pile_after, performance, report)`, the first two as by calling it.
     """
 

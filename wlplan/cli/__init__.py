@@ -1,8 +1,8 @@
-"""The command line: `wlplan plan`, `simulate`, `diggability`, `gradcheck`, `collect`, and so on.
+"""The command line: `wlplan plan`, `simulate`, `diggability`, `collect`, `train`, and so on.
 
-Results go to stdout, progress and remarks to stderr. Whatever is wrong with the input comes back as
-one line on stderr and exit code 2. What is slow to import is imported inside the commands, so that
-help and usage errors come at once.
+Results go to stdout, progress and remarks to stderr. Bad input ends with one line on stderr and
+exit code 2. What is slow to import is imported inside the commands, so that help and usage errors
+come at once.
 """
 
 from __future__ import annotations
@@ -21,25 +21,37 @@ from wlplan.cli import benchmark, gradients, learning, maps, planning
 from wlplan.errors import InputError
 
 
+class _InOrder(click.Group):
+    """A group that lists its commands in the order in which they were added."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
+
+
 @click.group(
+    cls=_InOrder,
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="\b\nExample: wlplan plan --loads 5 --out plan/\n"
+    "Options of a command: wlplan COMMAND --help",
 )
 @click.version_option(package_name="wlplan", message="%(prog)s %(version)s")
 @click.pass_context
 def wlplan(context: click.Context) -> None:
     """Plan the bucket loads of a wheel loader from a scan of the pile.
 
-    PILE is a height map (.npz, GeoTIFF) or a point cloud (.las, .laz, .ply) in metres; without it,
-    or as the word `bundled`, the pile that ships with the package is used.
+    PILE is a heightmap (.npz, GeoTIFF) or a point cloud (.las, .laz, .ply) in metres. The word
+    `bundled` stands for the pile that ships with the package. It is the default where PILE may be
+    left out.
     """
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
 
 
+# In the order in which people use them, which is that of the help.
 for _command in (
-    *(planning.plan, planning.simulate, maps.diggability, gradients.gradcheck),
-    *(learning.collect, learning.train, learning.evaluate, benchmark.bench),
+    *(planning.plan, planning.simulate, maps.diggability, learning.collect),
+    *(learning.train, learning.evaluate, gradients.gradcheck, benchmark.bench),
 ):
     wlplan.add_command(_command)
 
@@ -51,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Words after `wlplan`; by default those of the process.
 
     Returns:
-        Exit code: 0 done, 1 a fault of ours, 2 bad input or usage, 130 interrupted.
+        Exit code: 0 done, 1 a fault of wlplan, 2 bad input or usage, 130 interrupted.
     """
     if "_WLPLAN_COMPLETE" in os.environ:  # the shell asks for completions
         wlplan.main(prog_name="wlplan")
@@ -72,9 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except InputError as error:
             return _fail(str(error), 2)
         except (KeyboardInterrupt, click.Abort):
-            return _fail("interrupted: nothing half-written is left; run it again.", 130)
+            return _fail("interrupted: no half-written files are left; run it again.", 130)
         except BrokenPipeError:
-            # Whoever read our output has closed it: end quietly, also when Python flushes stdout.
+            # The reader of our output has closed it: end quietly, also when Python flushes stdout.
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0

@@ -1,4 +1,4 @@
-"""`wlplan bench`: what the package is measured by, measured on this machine."""
+"""`wlplan bench`: how fast the package is on this machine."""
 
 from __future__ import annotations
 
@@ -33,7 +33,10 @@ _FIGURES: dict[str, Callable[[float], str]] = {
 }
 
 
-@click.command()
+@click.command(
+    short_help="Measure how fast the package is on this machine.",
+    epilog="\b\nExample: wlplan bench --quick --only avalanche",
+)
 @with_options(
     click.option(
         "--only",
@@ -41,15 +44,15 @@ _FIGURES: dict[str, Callable[[float], str]] = {
         type=click.Choice(ITEMS),
         metavar="NAME",
         multiple=True,
-        help=f"Item to measure, may be given again: {', '.join(ITEMS)}. Default: all.",
+        help=f"Item to measure; may be given several times: {', '.join(ITEMS)}. Default: all.",
     ),
     click.option("--quick", is_flag=True, help="Fewer cases and repeats, and no whole plans."),
     out_option,
 )
 def bench(names: tuple[str, ...], quick: bool, out: str | None, seed: int, as_json: bool) -> None:
-    """Measure on this machine what the package is measured by, beside what there is to beat.
+    """Measure how fast the package is on this machine, beside its targets and other programs.
 
-    Compiling and running are timed apart. With --out: bench.json.
+    Compiling and running are timed separately. With --out: bench.json.
     """
     folder = None if out is None else checked_folder(out)
 
@@ -69,7 +72,7 @@ def bench(names: tuple[str, ...], quick: bool, out: str | None, seed: int, as_js
 
 
 def _print_bench(document: Mapping[str, Any]) -> None:
-    """What was measured as a table on stdout, a group after the other."""
+    """What was measured as a table on stdout, one group after the other."""
     device, versions = document["device"], document["versions"]
     table = titled_table(
         f"{device['processor']}, {device['cores']} cores; JAX {versions['jax']} on {device['kind']}"
@@ -77,8 +80,8 @@ def _print_bench(document: Mapping[str, Any]) -> None:
     table.add_column("item", width=30)
     for column in ("compile", "run,\nmedian", "10th to 90th\npercentile", "runs"):
         table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("found", width=28)
-    table.add_column("to reach", width=20)
+    table.add_column("result", width=28)
+    table.add_column("target", width=20)
     table.add_column("met", width=3)
     records = document["items"]
     for record, after in zip(records, (*records[1:], None), strict=True):
@@ -99,7 +102,7 @@ def _print_bench(document: Mapping[str, Any]) -> None:
             end_section=after is None or after["group"] != record["group"],
         )
     print_table(table)
-    print("Targets are for two CPU cores. What others take was measured elsewhere or published.")
+    print("Targets are for two CPU cores. Times of others were measured elsewhere or published.")
 
 
 def _duration(seconds: float) -> str:

@@ -33,13 +33,16 @@ if TYPE_CHECKING:
     from wlplan.studies.gradcheck import GradientCheck
 
 _FORMAT = "wlplan.gradcheck/1"
-# Every component costs two rollouts, and in the simulator, with its fixed number of steps, a
+# Every component takes two rollouts, and in the simulator, with its fixed number of steps, a
 # rollout takes ten times as long.
 _MOST_LOADS, _MOST_LOADS_SIMULATOR = 50, 10
 _VERDICTS = {"ok": ("ok", None), "kink": ("kink", "yellow"), "wrong": ("WRONG", "bold red")}
 
 
-@click.command()
+@click.command(
+    short_help="Compare the gradient of a plan's cost with finite differences.",
+    epilog="\b\nExample: wlplan gradcheck scan.tif --world low --loads 5",
+)
 @pile_argument
 @with_options(
     loads_option(
@@ -48,7 +51,7 @@ _VERDICTS = {"ok": ("ok", None), "kink": ("kink", "yellow"), "wrong": ("WRONG", 
         remark=f"; at most {_MOST_LOADS_SIMULATOR} in the simulator",
     ),
     world_option,
-    objective_option("What the plan costs"),
+    objective_option("Cost of the plan"),
     click.option(
         "--step",
         type=click.FloatRange(1e-9, 1e-3),
@@ -84,9 +87,9 @@ def gradcheck(
 ) -> None:
     """Compare the gradient of a plan's cost with central differences, in float64.
 
-    The plan is random, along the toe of PILE, its digs so close that each feels those before. A
-    component where the cost has a kink is named as such. Ends with exit code 1 if a component is
-    wrong. With --out: gradcheck.json.
+    The plan is random, along the toe of PILE, with digs so close that each depends on those before.
+    A component where the cost has a kink is reported as such. Ends with exit code 1 if a component
+    is wrong. With --out: gradcheck.json.
     """
     check_pile_name(pile_file)
     check_models(model, pile_state, world_name)
@@ -151,7 +154,7 @@ def gradcheck(
 
 
 def _print_check(check: GradientCheck, title: str) -> None:
-    """The components of a gradient as a table on stdout, with what is worth knowing of them."""
+    """The components of a gradient as a table on stdout, with a summary."""
     table = titled_table(title)
     for column in ("load", "component", "reverse", "central", "rel. error", "verdict"):
         table.add_column(column, justify="left" if column == "component" else "right")

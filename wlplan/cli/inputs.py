@@ -269,7 +269,7 @@ def _remark_on_training(kind: str | None, model: str | None, site: NamedSite) ->
     data = read_description(folder, None).get("dataset")
     data = data if isinstance(data, dict) else {}
     trained = {part: data.get(part) for part in ("soil", "machine")}
-    # A description may say nothing of them: data of one's own do not have to.
+    # A description may say nothing about them: your own data need not.
     others = [
         name
         for part, name, values in (
@@ -284,7 +284,7 @@ def _remark_on_training(kind: str | None, model: str | None, site: NamedSite) ->
         machine = f"the {machine.upper()}" if machine in MACHINES else machine
         remark(
             f"the model was trained for {soil} and {machine}, not for {' and '.join(others)}: "
-            f"what it predicts is for those"
+            f"its predictions hold for what it was trained for"
         )
     return bool(others)
 

@@ -29,7 +29,10 @@ from wlplan.training.settings import KINDS
 _MOST_CYCLES = 1_000_000
 
 
-@click.command()
+@click.command(
+    short_help="Play random loading cycles and store them as training data.",
+    epilog="\b\nExample: wlplan collect --cycles 10800 --out data.zarr",
+)
 @with_options(
     click.option(
         "--cycles",
@@ -43,17 +46,18 @@ _MOST_CYCLES = 1_000_000
         "--shard",
         type=ShardNumber(),
         default=None,
-        help="Play only the I-th of N parts, 1/N to N/N, of whole batches of cycles.",
+        help="Play only the I-th of N parts, 1/N to N/N. Each part holds whole batches of cycles.",
     ),
     click.option(
-        "--merge", "merging", is_flag=True, help="Join all shards PART.zarr instead of playing."
+        "--merge", "merging", is_flag=True, help="Join the shards PART.zarr instead of playing."
     ),
     click.option(
         "--protocol",
         type=click.Choice(PROTOCOLS),
         default="paper",
         show_default=True,
-        help="As the paper; near where it dug before; or with actions like the last slow one.",
+        help="How to choose poses and actions: as in the paper (paper), near where it dug before "
+        "(corridor), or with most actions near the last slow one (slow).",
     ),
     *site_options(),
     click.argument("parts", metavar="[--merge PART.zarr...]", nargs=-1),
@@ -72,16 +76,18 @@ def collect(
 ) -> None:
     """Play random loading cycles in the simulator and store them as training data.
 
-    Interrupted, the same command goes on where it stopped.
+    If interrupted, the same command continues where it stopped.
 
-    Several machines share the work with --shard: each plays a part, with the same settings.
-    --merge then joins the parts to the data set that one machine would have written.
+    Several machines can share the work with --shard: each plays a part, with the same settings.
+    --merge then joins the parts into the data set that one machine would have written.
     """
     if merging:
         _merge(parts, out, as_json)
         return
     if parts:
-        raise InputError(f"{parts[0]}: shards are only named with --merge: add it or leave it out.")
+        raise InputError(
+            f"{parts[0]}: shards are only named with --merge: add --merge, or leave the name out."
+        )
     checked_folder(out)
     site = site_named(soil, machine)
 
@@ -162,7 +168,10 @@ _MODELS = {kind.replace("_", "-"): kind for kind in KINDS}
 _ALL = "all"
 
 
-@click.command()
+@click.command(
+    short_help="Train a model on collected cycles.",
+    epilog="\b\nExample: wlplan train psi-low --data data.zarr --out my-psi-low",
+)
 @click.argument("model", metavar="MODEL", type=click.Choice((*_MODELS, _ALL)))
 @with_options(
     click.option(
@@ -170,9 +179,15 @@ _ALL = "all"
         metavar="DATA.zarr",
         required=True,
         multiple=True,
-        help="Data set to train on, or several of them; for all one, collected if it is missing.",
+        help="Data set to train on; may be given several times. With MODEL all: one, which is "
+        "collected if it is missing.",
     ),
-    click.option("--out", metavar="DIR", required=True, help="Folder of the model, or of all."),
+    click.option(
+        "--out",
+        metavar="DIR",
+        required=True,
+        help="Folder to write to. With MODEL all: one folder for all models.",
+    ),
     *training_options(),
 )
 def train(
@@ -180,11 +195,11 @@ def train(
 ) -> None:
     """Train MODEL on a data set and report its errors on cycles that it has not seen.
 
-    MODEL is psi-low or psi-high, which predict the performance, phi, which predicts the pile state,
-    or phi-vae, which does so as in the paper; or all: the models that ship, as they ship, of whose
-    settings only --epochs and --seed can be changed.
+    psi-low and psi-high predict the performance of a load. phi and phi-vae predict the pile after
+    it, phi-vae as in the paper. all trains every model that ships, with the settings that it ships
+    with: only --epochs and --seed can be changed.
 
-    Interrupted, the same command goes on where it stopped.
+    If interrupted, the same command continues where it stopped.
     """
     chosen = {name: value for name, value in options.items() if value is not None}
     kind = _MODELS.get(model)
@@ -196,7 +211,10 @@ def train(
     if kind is None:
         checked_folder(out)
         if len(data) > 1:
-            raise InputError("--data names one place for all: the other data sets lie beside it.")
+            raise InputError(
+                "with MODEL all, --data names one data set, beside which the others lie: give it "
+                "once."
+            )
         _train_all(data[0], out, epochs=chosen.get("epochs"), seed=seed, as_json=as_json)
         return
     settings = KINDS[kind](seed=seed, **chosen)
@@ -250,26 +268,29 @@ def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: b
     print(f"collecting and training {work.text()}")
     for trained, words in (
         (True, "written"),
-        (False, "kept, being of the same data, settings and versions"),
+        (False, "kept, since data, settings and versions are the same"),
     ):
         places = [str(Path(out) / kind) for kind in reports if (kind in stages) is trained]
         if places:
             print(f"{words}: {', '.join(places)}")
 
 
-@click.command()
+@click.command(
+    short_help="Report the errors and the speed of a model.",
+    epilog="\b\nExample: wlplan evaluate --data data.zarr --model my-psi-low",
+)
 @with_options(
     click.option("--data", metavar="DATA.zarr", required=True, help="Data set to compare with."),
     click.option(
-        "--model", metavar="DIR", default=None, help="Model; default: the one that ships."
+        "--model", metavar="DIR", default=None, help="Model. Default: the psi-low that ships."
     ),
 )
 def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     """Report the errors of a model on simulated cycles, and the time of an inference.
 
-    Of the data set that it was trained on, only the part that was held out counts. The split
-    belongs to the model, so --seed changes nothing. What the paper reports of its model, on data of
-    its own simulator, stands beside.
+    Of the data set that the model was trained on, only the held-out part counts. The split belongs
+    to the model, so --seed changes nothing. The tables also have the values that the paper
+    reports of its own model, on data of its own simulator.
     """
     check_is_folder(data, "data set", "wlplan collect")
     if model is not None:
@@ -289,8 +310,8 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     if part is dataset and shares_piles(dataset, description):
         seed_of = dataset.attributes["seed"]
         remark(
-            f"{data} has seed {seed_of}, as a data set that the model was trained on: it has seen "
-            f"some of these piles, and errs less on them. Collect with another seed."
+            f"{data} has seed {seed_of}, as a data set of the model's training: the model has seen "
+            f"some of these piles, and its errors on them are smaller. Collect with another seed."
         )
     found = evaluated(predictor, part, description)
     kind = description["kind"].replace("_", "-")

@@ -38,7 +38,10 @@ _FORMAT = "wlplan.diggability/1"
 _MOST_LOCATIONS = 10_000
 
 
-@click.command()
+@click.command(
+    short_help="Map what one action would yield all around a pile.",
+    epilog="\b\nExample: wlplan diggability scan.tif --locations 150 --out map/",
+)
 @pile_argument
 @with_options(
     click.option(

@@ -1,4 +1,4 @@
-"""What the options of the commands have in common, their types and names included."""
+"""What the options of the commands have in common, including their types and names."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def with_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
             type=click.IntRange(0, 2**31 - 1),
             default=0,
             show_default=True,
-            help="Seed of everything random.",
+            help="Seed of all random choices.",
         ),
         click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout."),
     )
@@ -266,8 +266,8 @@ def objective_option(purpose: str) -> Callable[[Any], Any]:
         type=NameOrReference("objective", OBJECTIVES),
         default=next(iter(OBJECTIVES)),
         show_default=True,
-        help=f"{purpose}: {', '.join(OBJECTIVES)}, or package.module:name of terms or a function "
-        f"of a loading.",
+        help=f"{purpose}: {', '.join(OBJECTIVES)}, or package.module:Name of an objective of your "
+        f"own.",
     )
 
 
@@ -302,45 +302,47 @@ world_option = click.option(
     type=NameOrReference("world", FOR_PLANNING),
     default="hybrid",
     show_default=True,
-    help=f"What predicts: {', '.join(FOR_PLANNING)}, or package.module:function.",
+    help=f"World that predicts the loads: {', '.join(FOR_PLANNING)}, or package.module:Name of one "
+    f"of your own.",
 )
 planner_option = click.option(
     "--planner",
     type=NameOrReference("planner", planners.NAMES),
     default="gradient",
     show_default=True,
-    help=f"How to plan: {', '.join(planners.NAMES)}, or package.module:Name of a class or value.",
+    help=f"Planner: {', '.join(planners.NAMES)}, or package.module:Name of one of your own.",
 )
 engine_option = click.option(
     "--engine",
     type=click.Choice(ENGINES),
     default=ENGINES[0],
     show_default=True,
-    help="What plays: the simulator or discrete elements (minutes a load; wlplan[dem]).",
+    help="Engine that plays the plan: the simulator, or discrete elements, which take minutes a "
+    "load and need wlplan[dem].",
 )
 model_options = (
     click.option(
         "--model",
         metavar="DIR",
         default=None,
-        help="ψ from `wlplan train`, psi-low or psi-high, for a learned world instead of the one "
-        "that ships.",
+        help="Folder of a psi-low or psi-high from `wlplan train`, for a learned world, instead of "
+        "the one that ships.",
     ),
     click.option(
         "--pile-state",
         metavar="DIR",
         default=None,
-        help="φ from `wlplan train` for a learned world, instead of the one that ships or of the "
-        "automaton alone.",
+        help="Folder of a phi or phi-vae from `wlplan train`, for a learned world, instead of the "
+        "phi that ships (high) or of cutting out a strip (low, hybrid).",
     ),
 )
 truck_option = click.option(
     "--truck",
     type=Numbers("X,Y[,HEADING_DEG]", 2),
     default=None,
-    help="Where the loader stands when it dumps [m], in the frame of the scan, and which way it "
-    "then heads; without a heading the one with the shortest ways. Default: 12 m west of the pile.",
+    help="Where the loader stands when it dumps [m], in the frame of the scan, and its heading "
+    "there. Default heading: the one with the shortest ways. Default place: 12 m west of the pile.",
 )
 out_option = click.option(
-    "--out", metavar="DIR", default=None, help="Folder to write to; made if it is missing."
+    "--out", metavar="DIR", default=None, help="Folder to write to. It is made if it is missing."
 )

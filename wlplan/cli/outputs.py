@@ -63,7 +63,7 @@ def json_text(document: Mapping[str, Any]) -> str:
     """A result as JSON, without a newline at the end.
 
     Raises:
-        InputError: If a number is not finite, which JSON has no word for.
+        InputError: If a number is not finite, which JSON cannot express.
     """
     try:
         return json.dumps(document, indent=2, allow_nan=False)
@@ -75,7 +75,7 @@ def json_text(document: Mapping[str, Any]) -> str:
 
 
 def remark(text: str) -> None:
-    """Tell on stderr what is worth knowing but no error."""
+    """Print on stderr what is worth knowing but no error."""
     print(f"note: {text}", file=sys.stderr)
 
 

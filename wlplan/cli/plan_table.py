@@ -12,7 +12,7 @@ from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error
 
 
 def remark_on_ledger(ledger: Mapping[str, Any]) -> None:
-    """Remarks if volume and mass of a ledger do not agree, or a solver did not end well."""
+    """Remarks if volume and mass of a ledger disagree, or a solver did not come to rest."""
     error = ledger_error(ledger)
     if error > LEDGER_TOLERANCE:
         remark(f"the ledger of the simulated pile is off by {100.0 * error:.2g} %")

@@ -43,17 +43,20 @@ if TYPE_CHECKING:
     from wlplan.types import Performance
 
 _MOST_LOADS = 500
-# What a plan says about where it comes from; playing it again keeps that.
+# What a plan says about where it comes from; kept when it is played again.
 _ORIGIN_FIELDS = ("world", "model", "pile_state", "planner", "seed")
 
 
-@click.command()
+@click.command(
+    short_help="Plan the next loads from a pile.",
+    epilog="\b\nExample: wlplan plan scan.tif --loads 10 --truck 12,3,90 --out plan/",
+)
 @pile_argument
 @with_options(
     loads_option(default=15, most=_MOST_LOADS),
     world_option,
     planner_option,
-    objective_option("What to make small"),
+    objective_option("What the plan minimises"),
     click.option(
         "--referee/--no-referee",
         default=True,
@@ -176,7 +179,10 @@ def _print_written(folder: Path | None, written: list[str] | None) -> None:
     print(f"written: {folder / first}, and {', '.join(others)} beside it")
 
 
-@click.command()
+@click.command(
+    short_help="Play a plan in the simulator or in discrete elements.",
+    epilog="\b\nExample: wlplan simulate scan.tif plan/plan.json --out again/",
+)
 @click.argument("pile_file", metavar="PILE")
 @click.argument("plan_file", metavar="PLAN.json")
 @with_options(engine_option, truck_option, *site_options("that of the plan"), out_option)
@@ -191,12 +197,13 @@ def simulate(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Play PLAN.json in an engine on PILE and compare with what was predicted.
+    """Play PLAN.json in an engine on PILE and compare the outcome with the prediction.
 
     With --out: plan.json, plan.png, totals.png and report.html, of the plan as it was played.
 
     Truck, soil and machine are those of the plan, unless given. No engine has randomness, so
-    --seed changes nothing. Interrupted with --engine dem, the same command goes on where it was.
+    --seed changes nothing. If interrupted, the same command with --engine dem continues where it
+    was.
     """
     check_pile_name(pile_file)
     site_named(soil, machine)  # wrong options are refused before anything heavy is imported
@@ -218,7 +225,7 @@ def simulate(
     if (site.soil, site.machine) != (recorded.soil, recorded.machine):
         remark("the plan was made for another soil or machine than it is played with")
     objective = given.get("objective")
-    # A name of somebody else's module in a file is no reason to run it.
+    # A plan file must not make us import somebody else's module.
     objective = objective if objective in OBJECTIVES else next(iter(OBJECTIVES))
     place = site.with_receiver(pile, contour, truck if truck is not None else _truck_of(given))
     cycles: list[Any] = []

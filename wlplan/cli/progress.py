@@ -49,7 +49,7 @@ class Progress:
             self._bars.stop()
 
     def __call__(self, stage: str, done: int, total: int, cost: float | None) -> None:
-        """Tell how far a stage is, and the cost reached if there is one."""
+        """Show how far a stage is, and the cost reached if there is one."""
         text = "" if cost is None else f"cost {cost:.3f}"
         now = time.monotonic()
         pace = self._pace(stage, done, total, now)

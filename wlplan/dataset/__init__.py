@@ -8,7 +8,7 @@ The protocol "corridor" digs on where it dug before, as plans do; "slow" takes a
 one by which the filling was slow. All else is the same.
 
 Everything random about an episode follows from the seed and its number alone, so a collection that
-was cut short goes on where it stopped and ends with the same bytes. For the same reason shards,
+was cut short continues where it stopped and ends with the same bytes. For the same reason shards,
 collected apart and joined, are the data set of a single collector.
 """
 

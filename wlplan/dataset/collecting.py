@@ -29,7 +29,7 @@ def collect(
     simulator: Simulator = _SIMULATOR,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Simulates loading cycles and stores them; goes on where an earlier call stopped.
+    """Simulates loading cycles and stores them; continues where an earlier call stopped.
 
     A data set of more cycles is a longer series of the same episodes. Cycles are written batch by
     batch; what was written stays intact whatever happens to the process.
@@ -82,6 +82,6 @@ def collect(
         advice = "free some space" if error.errno == errno.ENOSPC else "choose another place"
         if done:
             advice += (
-                f"; {done} of {layout.size} cycles are safe, the same command goes on from there"
+                f"; {done} of {layout.size} cycles are safe, the same command continues from there"
             )
         raise InputError(f"{path}: cannot be written ({reason}): {advice}.") from error

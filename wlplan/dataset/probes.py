@@ -1,4 +1,4 @@
-"""Probes: a few cycles of a data set by which one tells later whether the simulator has changed.
+"""Probes: a few cycles of a data set that show later whether the simulator has changed.
 
 A hash of the source would change with every comment, one of outcomes with the processor. So the
 outcomes themselves are kept, and compared within a tolerance with those of the same cycles today:

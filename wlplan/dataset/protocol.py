@@ -39,7 +39,7 @@ _STAY, _NEAR = 0.85, 0.5
 _SLOW_FILLING, _REPEAT, _SIMILAR = 4.0, 0.8, 0.1
 
 PROTOCOLS = ("paper", "corridor", "slow")
-"""How an episode goes on. "paper": anywhere along the toe with any action, as in section 6.2.
+"""How an episode continues. "paper": anywhere along the toe with any action, as in section 6.2.
 "corridor": mostly near where it dug before, as plans do: so corridors come about, and what stands
 between them. "slow": anywhere, mostly with an action like that of the last slow filling: so there
 are far more loadings that stall, or nearly do, than the paper's few in a hundred."""

@@ -115,8 +115,8 @@ def resume(path: Path, wanted: Mapping[str, Any]) -> int:
     if differs is not None:
         name, found, value = differs
         raise InputError(
-            f"{path}: was begun with {name} {found!r}, not {value!r}: use the same settings to go "
-            f"on with it, or choose another place."
+            f"{path}: was begun with {name} {found!r}, not {value!r}: use the same settings to "
+            f"continue it, or choose another place."
         )
     done = int(attributes["cycles_done"])
     lacking = [name for name in VARIABLES if not (path / name / "zarr.json").is_file()]
@@ -243,7 +243,7 @@ def _is_young(lock: Path) -> bool:
 
 
 def _is_alive(holder: str) -> bool:
-    """Whether the process that wrote a lock still runs, as far as can be told."""
+    """Whether the process that wrote a lock still runs, as far as one can see."""
     try:
         number, start, host = holder.split(" ", 2)
         pid = int(number)

@@ -116,7 +116,7 @@ VARIABLES: dict[str, Variable] = {
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """Loading cycles in memory; `VARIABLES` tells meaning and unit of each array."""
+    """Loading cycles in memory; `VARIABLES` has the meaning and unit of each array."""
 
     mass: Float[np.ndarray, " n"]
     time: Float[np.ndarray, " n"]
@@ -155,9 +155,7 @@ def join(datasets: Sequence[Dataset]) -> Dataset:
     for other in datasets[1:]:
         for name in ("soil", "machine"):
             if other.attributes.get(name) != first.attributes.get(name):
-                raise InputError(
-                    f"The data sets are of another {name} each: a model is trained for one."
-                )
+                raise InputError(f"The data sets differ in {name}: a model is trained for one.")
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(d, name) for d in datasets]) for name in VARIABLES
     }
@@ -184,7 +182,7 @@ def split(
     """Splits a data set at random into parts that share no episode, the variable `rollout`.
 
     Cycles of one episode resemble each other: they dig the same pile. Split by cycle, a test set
-    would not tell how a model does on a pile that it has not seen.
+    would not show how a model does on a pile that it has not seen.
 
     Args:
         dataset: Data set to split.

@@ -124,7 +124,7 @@ class WorkerProcess:
                 return
         raise InputError(
             f"A process that simulates cycles has ended (exit code {self.process.wait()}), perhaps "
-            f"for want of memory: the same command goes on with what is stored."
+            f"for lack of memory: the same command continues with what is stored."
         )
 
     def stop(self) -> None:

@@ -53,7 +53,7 @@ def read_pile(
 ) -> Pile:
     """Read a pile and resample it to the grid spacing of the models, 0.1 m.
 
-    The ending of the name tells the format: height maps are `.npz` or GeoTIFF, point clouds LAS,
+    The ending of the name decides the format: height maps are `.npz` or GeoTIFF, point clouds LAS,
     LAZ or PLY, all in metres, z up. The modules of `wlplan.io.readers`, one for each format, say
     what a file has to hold; `wlplan.io.register_reader` takes more of them. The height of a cell of
     a point cloud is the median of its points; cells without points are unseen, but for single ones

@@ -4,4 +4,4 @@ ACTIVATIONS = ("swish", "leaky_relu")
 """Activation functions of the paper's grid search."""
 
 ENCODERS = ("convolutional", "principal")
-"""What tells ψ_high about the map: the paper's encoder, and ours."""
+"""How ψ_high sees the map: by the paper's encoder, or by ours."""

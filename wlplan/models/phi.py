@@ -1,4 +1,4 @@
-"""φ of ours: the change of the local heightmap, in its principal components, mass exact.
+"""Our φ: the change of the local heightmap, in its principal components, mass exact.
 
 What a loading does to a pile lies in the frame of the bucket: a cut, what slid into it, what was
 pushed aside. So some fixed patterns, the principal components of the changes in the training data,

@@ -14,8 +14,8 @@ class PileStatePredictor(Protocol):
     """φ: how a loading changes the local heightmap.
 
     Attributes:
-        conserves_volume: Whether exactly the given volume leaves the map. If not, volume and floor
-            are ignored, and what leaves is the prediction's own.
+        conserves_volume: Whether exactly the volume that it is given leaves the map. If not, it
+            ignores volume and floor, and what leaves is its own prediction.
     """
 
     conserves_volume: ClassVar[bool]

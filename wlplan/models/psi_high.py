@@ -1,8 +1,8 @@
 """ψ_high: what one loading yields and costs, from the local heightmap. Paper, section 4.4.
 
-Two encoders tell the network about the map. The paper's is convolutional. Ours takes the principal
-components of the maps and the four characteristics: smooth in every height, and with as little
-detail as a few thousand cycles can teach.
+The network sees the map through one of two encoders. The paper's is convolutional. Ours takes the
+principal components of the maps and the four characteristics: smooth in every height, and with as
+little detail as a few thousand cycles can teach.
 """
 
 from __future__ import annotations

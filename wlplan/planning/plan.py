@@ -59,7 +59,7 @@ def plan_loads(
         seed: Of everything random.
         referee: World that plays the planner's candidates, each dig at the toe of the pile as the
             referee has it by then, and picks the cheapest; the poses of the result are the ones
-            it dug at. A candidate that `world` finds dearer than the planner's limit, for the
+            it dug at. A candidate that costs more in `world` than the planner's limit, for the
             gradient planner the greedy plan, is out. None: `world` picks, with its own poses.
         progress: Called as the planner advances.
         contour: The toe to dig along; default: that of the pile.
@@ -105,7 +105,7 @@ def planner_of(planner: str | Planner, world: World) -> Planner:
 
 
 def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> PlanResult:
-    """The cheapest of a planner's candidates that is not dearer than its limit.
+    """The cheapest of a planner's candidates that costs no more than its limit.
 
     Args:
         job: What was planned for, in the world that planned.

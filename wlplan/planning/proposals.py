@@ -20,8 +20,8 @@ class Proposals(NamedTuple):
     """
 
     candidates: Decisions | LoadingPlan  # leaves [K, N], or [N] of a single plan
-    # A plan like them, leaves [N], that may be picked too; what the planning world finds dearer is
-    # out. None: nothing is.
+    # A plan like them, leaves [N], that may be picked too; what costs more in the planning world
+    # is out. None: nothing is.
     limit: Decisions | LoadingPlan | None = None
 
 

@@ -28,7 +28,7 @@ class Range(NamedTuple):
 def parameter(default: float, low: float, high: float, unit: str) -> Any:
     """A field of a machine or a soil.
 
-    The ranges are ours: wide, so that they stop slips of the pen and not people. Where the
+    We chose the ranges: wide, so that they stop typing errors and not people. Where the
     simulator itself needs a bound, the comment above the field says why.
 
     Args:

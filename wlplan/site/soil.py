@@ -55,7 +55,7 @@ class Soil:
 
 GRAVEL = Soil()
 
-# The further soils are loose, as they lie in a heap after digging. Their fitted group is that of
+# The further soils are loose, as they lie in a pile after digging. Their fitted group is that of
 # gravel: nothing was fitted for them. Densities: the middle of what published tables of loose
 # materials for choosing buckets and trucks give. Internal friction: typical textbook range.
 

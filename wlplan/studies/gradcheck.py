@@ -121,7 +121,7 @@ def random_plan(
         InputError: If no load is asked for, there is nothing to dig, or a bucket can start nowhere.
     """
     if loads < 1:
-        raise InputError(f"{loads} loads were asked for; ask for at least 1")
+        raise InputError(f"{loads} loads were asked for: ask for at least 1.")
     contour = toe_contour(pile) if contour is None else contour
     check_accessible(contour.accessible)
     accessible = np.flatnonzero(contour.accessible)

@@ -1,7 +1,7 @@
 """Training and evaluating the learned models. Paper, section 6.4.
 
 A trained model is saved as a directory, see `wlplan.models.storage`. A training that
-was cut short goes on where it stopped and ends with the same weights::
+was cut short continues where it stopped and ends with the same weights::
 
     settings = PsiLowSettings(members=5, epochs=40)
     model, report = train(settings, open_dataset("data.zarr"), out="my-psi-low")

@@ -1,4 +1,4 @@
-"""Training of φ of ours. Paper, section 6.4.2."""
+"""Training of our φ. Paper, section 6.4.2."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def train(
     out: str | os.PathLike[str] | None,
     progress: Progress | None,
 ) -> tuple[HeightChangeModel, PileStateErrors]:
-    """Trains φ of ours, see `wlplan.training.train`; with mirrored maps, as ψ_high."""
+    """Trains our φ, see `wlplan.training.train`; with mirrored maps, as ψ_high."""
     trainer = Trainer(dataset, out, settings, state_tables)
     network = HeightChange(
         settings.hidden,

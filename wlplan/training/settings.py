@@ -1,7 +1,7 @@
 """Settings of the trainings, one class for each kind of model. Without JAX, for the command line.
 
 Each field carries its meaning and what it may be, see `Setting`. From there come the options of
-`wlplan train`, what `model.json` records, and what tells one training from another.
+`wlplan train`, what `model.json` records, and what distinguishes one training from another.
 
 A kind of training is a class here, in `KINDS`, and a module of the name of the kind beside this
 one, with a function `train(settings, dataset, *, out, progress)`.
@@ -176,7 +176,7 @@ class PsiHighSettings(PerformanceSettings):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhiSettings(Settings):
-    """How φ of ours is trained."""
+    """How our φ is trained."""
 
     kind: ClassVar[str] = "phi"
 
@@ -187,7 +187,7 @@ class PhiSettings(Settings):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhiVaeSettings(Settings):
-    """How φ of the paper is trained, in two stages with as many epochs each."""
+    """How the paper's φ is trained, in two stages with as many epochs each."""
 
     kind: ClassVar[str] = "phi_vae"
 

@@ -54,8 +54,8 @@ def train(
 
     The data set is split by rollout, alike for all seeds, so that errors can be compared. Of all
     epochs the weights with the least loss on the validation part are kept; the report is on the
-    test part, which plays no role in training. Killed, the same call goes on where it was and ends
-    with the same weights.
+    test part, which plays no role in training. If killed, the same call continues where it was and
+    ends with the same weights.
 
     Args:
         settings: What is trained, and how: `PsiLowSettings`, `PsiHighSettings`, `PhiSettings` or
@@ -79,8 +79,8 @@ def train(
 class Trainer:
     """A training from its data set to the saved model.
 
-    The data set is split by rollout, without the cycles that are not valid. Killed, a training that
-    is asked for again goes on where it was and ends with the same weights.
+    The data set is split by rollout, without the cycles that are not valid. A training that was
+    killed continues where it was when asked for again, and ends with the same weights.
 
     Args:
         dataset: Loading cycles, of one or several data sets; each is split by itself.

@@ -56,7 +56,7 @@ def train_all(
 ) -> dict[str, dict[str, Any]]:
     """Trains every model that ships and saves them side by side.
 
-    Killed, the same call goes on where it was: models that it has finished are kept.
+    If killed, the same call continues where it was: models that it has finished are kept.
 
     Args:
         data: Data set of the paper's protocol; the others lie beside it, with something added to

@@ -39,7 +39,7 @@ class FunctionWorld(struct.PyTreeNode):
 
     @property
     def has_uncertainty(self) -> bool:
-        """Whether it says how far its performance may be off."""
+        """Whether it gives the uncertainty of its performance."""
         return self.deviation is not None
 
     def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
@@ -50,7 +50,7 @@ class FunctionWorld(struct.PyTreeNode):
         """
         if self.deviation is None:
             raise InputError(
-                "this world has no uncertainty: give one by wlplan.world(function, "
+                "this world has no uncertainty: give it one with wlplan.world(function, "
                 "uncertainty=...)."
             )
         return self.deviation(pile, pose, action)

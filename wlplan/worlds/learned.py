@@ -65,7 +65,7 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
 
     @property
     def has_uncertainty(self) -> bool:
-        """Whether ψ says how far it may be off: an ensemble does."""
+        """Whether ψ gives the uncertainty of what it predicts: an ensemble does."""
         return hasattr(self.performance, "with_deviation")
 
     def uncertainty(self, pile: Pile, pose: Pose, action: Action) -> Performance:
@@ -79,8 +79,8 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
         """
         if not self.has_uncertainty:
             raise InputError(
-                "the model of this world is a single one and has no uncertainty: train an ensemble "
-                "with `wlplan train --members 5`."
+                "the model of this world is a single network without uncertainty: train an "
+                "ensemble with `wlplan train --members 5`."
             )
         return _deviation(self, pile, pose, action)
 

@@ -22,7 +22,7 @@ SPACING, PLATE_RADIUS = 0.075, 0.05
 
 
 def heaped_volume(section: np.ndarray, width: float) -> float:
-    """Volume with a heap of slope 1:2 over the opening [m^3], as buckets are rated (ISO 7546).
+    """Volume heaped at a slope of 1:2 over the opening [m^3], as buckets are rated (ISO 7546).
 
     Args:
         section: Corners from the cutting edge to the upper edge [m], shape [n, 2].

@@ -12,7 +12,7 @@ from wlplan.site.soil import GRAVEL
 class Grains:
     """Properties of the spheres and of their contacts.
 
-    Chosen so that a heap of them has the density of the paper's gravel and, in a slice 1 m wide, an
+    Chosen so that a pile of them has the density of the paper's gravel and, in a slice 1 m wide, an
     angle of repose of 33 degrees, give or take 3. No triaxial test was simulated.
     """
 

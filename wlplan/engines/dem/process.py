@@ -1,7 +1,7 @@
 """The process boundary: jobs for the engine's own process, and what it has answered before.
 
 A result is kept in the user's cache under a name that is a digest of its job. So the bed is made
-once, and a sequence of loadings that was interrupted goes on where it was: the engine has no
+once, and a sequence of loadings that was interrupted continues where it was: the engine has no
 randomness, and what was played is read, not played again.
 """
 
@@ -124,7 +124,7 @@ def play(
 
 
 def bed_file(settings: DemSettings) -> Path:
-    """The file of the bed that piles are cut from, made if it is missing, which stderr is told.
+    """The file of the bed that piles are cut from, made if it is missing, with a note on stderr.
 
     Args:
         settings: Of the engine; only the grains matter.
@@ -206,7 +206,7 @@ def run_job(
 
 
 def _complaint(code: int, said: str) -> str:
-    """What to tell of a worker that failed."""
+    """What to report of a worker that failed."""
     lines = [line for line in said.splitlines() if line.strip()]
     last = lines[-1] if lines else "it said nothing"
     if code == 2 and last.startswith("error: "):

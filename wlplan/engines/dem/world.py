@@ -74,7 +74,7 @@ class DiscreteElements(struct.PyTreeNode):
         Args:
             surface: As of `view`.
             action: delta_bm, k_bm, delta_bk, k_bk.
-            tell: Told of soil that the engine does not see.
+            tell: Called with a note on soil that the engine does not see.
 
         Raises:
             InputError: If the engine is missing or fails.
@@ -104,7 +104,7 @@ class DiscreteElements(struct.PyTreeNode):
     ) -> tuple[Pile, Performance, CycleRecord]:
         """Plays one loading outside of any trace.
 
-        What was played is in the cache: to go on after an interrupt, begin again.
+        What was played is in the cache: to continue after an interrupt, begin again.
 
         Args:
             pile: Pile before.
@@ -138,7 +138,7 @@ class DiscreteElements(struct.PyTreeNode):
         ]
         return (notes if ignored else []) + [
             f"a load takes a minute or more; those that were played are kept in "
-            f"{process.cache_folder()}, so that the same command goes on where it was interrupted"
+            f"{process.cache_folder()}, so that the same command continues where it was interrupted"
         ]
 
     def leave(
@@ -207,8 +207,8 @@ def _without_derivative(world: DiscreteElements, surface: Array, numbers: Array)
 @_without_derivative.defjvp
 def _no_jvp(world: DiscreteElements, primals: Any, tangents: Any) -> Any:
     raise InputError(
-        "the discrete elements have no derivative: plan in a model, or use a planner without "
-        "gradients"
+        "the discrete elements have no derivative: plan in a learned world, or use a planner "
+        "without gradients."
     )
 
 

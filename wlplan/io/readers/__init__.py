@@ -16,7 +16,7 @@ named after its ending without the dot::
     [project.entry-points."wlplan.readers"]
     xyz = "their_package.xyz"
 
-The endings of the package's own readers stay theirs.
+Nobody else can register the endings of the package's own readers.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """`.tif`, `.tiff`: GeoTIFF, band 1, with square cells along the axes, in metres.
 
-Nodata and NaN are unseen. A file without georeference is refused, since nothing tells its cell
+Nodata and NaN are unseen. A file without georeference is refused, since nothing gives its cell
 size.
 """
 

@@ -56,7 +56,7 @@ class Gradient:
     ) -> Proposals:
         """The cheapest plans that were passed, in the order of their cost, leaves [K, N].
 
-        The limit is the greedy plan: nothing dearer is handed on. Arguments as of
+        The limit is the greedy plan: nothing that costs more is handed on. Arguments as of
         `Planner.propose`.
 
         Raises:

@@ -45,7 +45,7 @@ def run_bench(
     """
     unknown = [name for name in names if name not in ITEMS]
     if unknown:
-        raise InputError(f"unknown item {unknown[0]!r}; choose among {', '.join(ITEMS)}")
+        raise InputError(f"unknown item {unknown[0]!r}: choose one of {', '.join(ITEMS)}.")
     setup = Setup(seed=seed, quick=quick)
     items = [item for item in ITEMS.values() if not names or item.name in names]
     records = []

@@ -17,7 +17,7 @@ from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
 from wlplan.terrain.toe import toe_contour
 from wlplan.types import Pile, Pose
 
-# Volume of a dig [m^3], and how far the heading may be off the normal of the toe [rad].
+# Volume of a dig [m^3], and largest angle between its heading and the normal of the toe [rad].
 _LEAST_VOLUME, _MOST_VOLUME = 0.5, 3.0
 _HEADING_SPREAD = math.radians(10.0)
 

@@ -5,8 +5,8 @@ f * max(h_i - h_k - d tan(repose), 0) from the higher to the lower cell (eight n
 flow is antisymmetric, so volume is kept by construction; with f = 1/8 the Jacobian of a sweep is
 symmetric, not negative and has unit row sums, so a sweep is monotone, non-expansive in every
 p-norm, and its gradient cannot explode. This is our reading of the mass-preserving automaton of
-Pla-Castells et al. (2004), which the paper employs (section 4.6), with eight neighbours in place
-of four. `sweeps` and `converged` are this automaton as it stands.
+Pla-Castells et al. (2004), which the paper employs (section 4.6), with eight neighbours
+instead of four. `sweeps` and `converged` are this automaton as it stands.
 
 Sweeps alone take thousands to bring a bucket's hole to rest. `settle` gets there in dozens:
 
