@@ -221,7 +221,7 @@ def test_bad_requests_are_refused():
         plan_loads(bowl_world, cone(), loads=0)
     with pytest.raises(InputError, match="unknown objective"):
         plan_loads(bowl_world, cone(), objective="speed")
-    with pytest.raises(InputError, match="derivatives"):
+    with pytest.raises(InputError, match="no derivative"):
         plan_loads(wlplan.Simulator(), cone(), planner="gradient")
     with pytest.raises(InputError):
         plan_loads(bowl_world, Pile(jnp.zeros((100, 100)), 0.1))
