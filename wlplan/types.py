@@ -54,7 +54,7 @@ class Pile(struct.PyTreeNode):
             valid: ArrayLike | list[Any] | None = None,
         ) -> None: ...
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if isinstance(self.origin, tuple | list) and all(
             isinstance(value, int | float | np.number) for value in self.origin
         ):
@@ -84,7 +84,7 @@ class Pose(struct.PyTreeNode):
             heading: ArrayLike | list[Any],
         ) -> None: ...
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _as_arrays(self, "x", "y", "heading")
 
 
@@ -107,7 +107,7 @@ class Action(struct.PyTreeNode):
             k_bk: ArrayLike | list[Any],
         ) -> None: ...
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _as_arrays(self, "delta_bm", "k_bm", "delta_bk", "k_bk")
 
 
@@ -138,7 +138,7 @@ class Performance(struct.PyTreeNode):
             work: ArrayLike | list[Any],
         ) -> None: ...
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _as_arrays(self, "mass", "time", "work")
 
 

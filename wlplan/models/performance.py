@@ -48,7 +48,7 @@ class PerformanceModel(struct.PyTreeNode):
 
     view_variable: ClassVar[str]
 
-    params: nnx.State
+    params: nnx.State[Any, Any]
     inputs: Normaliser  # characteristics [rad, rad, 1/m, 1/m], then action
     outputs: Normaliser  # mass [tonne], time [s], work [kJ]
     graph: nnx.GraphDef[Any] = struct.field(pytree_node=False)

@@ -14,8 +14,7 @@ more, where there is more to say:
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import jax
 from flax import struct
@@ -27,7 +26,7 @@ from wlplan.types import Action, Performance, Pile, Pose, World
 class FunctionWorld(struct.PyTreeNode):
     """A plain function as a world that can be passed to jitted functions, and what it can do."""
 
-    function: Callable[..., Any] = struct.field(pytree_node=False)
+    function: World = struct.field(pytree_node=False)
     differentiable: bool | None = struct.field(pytree_node=False, default=None)  # None: not said
 
     def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
@@ -35,7 +34,7 @@ class FunctionWorld(struct.PyTreeNode):
         return self.function(pile, pose, action)
 
 
-def world(function: Callable[..., Any], *, differentiable: bool = True) -> FunctionWorld:
+def world(function: World, *, differentiable: bool = True) -> FunctionWorld:
     """A function as a world that says what it can do.
 
     Args:

@@ -60,7 +60,8 @@ def section_of(machine: WheelLoader) -> np.ndarray:
             f"not hold {machine.bucket_heaped:g} m³ heaped at any sensible height: check "
             f"bucket_heaped, bucket_depth and bucket_width."
         )
-    return _SECTION * np.array([stretch, rise])
+    section: np.ndarray = _SECTION * np.array([stretch, rise])
+    return section
 
 
 def plate_spheres(machine: WheelLoader) -> np.ndarray:
@@ -110,4 +111,5 @@ def inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
     straddles = (z0 > z) != (z1 > z)
     rise = np.where(z1 == z0, 1.0, z1 - z0)
     crossing = x0 + (z - z0) * (x1 - x0) / rise
-    return ((straddles & (x < crossing)).sum(axis=1) % 2).astype(bool)
+    odd: np.ndarray = (straddles & (x < crossing)).sum(axis=1) % 2
+    return odd.astype(bool)
