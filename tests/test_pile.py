@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from laws import volume
 
 from wlplan.errors import InputError
 from wlplan.site.machine import WA320
 from wlplan.terrain.floor import estimate_ground, fill_unseen
 from wlplan.terrain.resampling import resample
 from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
-from wlplan.terrain.toe import evenly_spaced, toe_contour
-from wlplan.terrain.volume import volume
+from wlplan.terrain.toe import toe_contour
 from wlplan.types import Pile
 
 CELL = 0.1
@@ -326,22 +326,6 @@ def test_nothing_to_dig(height, why):
     with pytest.raises(InputError, match="Nothing to dig") as error:
         toe_contour(pile_of(height))
     assert_one_line(error)
-
-
-def test_evenly_spaced_points_are_accessible_and_evenly_spaced():
-    x, y = grid()
-    contour = toe_contour(pile_of(np.maximum(cone(x, y), 0.0), valid=x < 2.0))
-    chosen = evenly_spaced(contour, 20)
-    assert contour.accessible[chosen].all()
-    order = np.cumsum(contour.accessible)[chosen]
-    assert np.ptp(np.diff(order)) <= 1
-    assert len(np.unique(evenly_spaced(contour, int(contour.accessible.sum())))) == (
-        contour.accessible.sum()
-    )
-    for n in (0, int(contour.accessible.sum()) + 1):
-        with pytest.raises(InputError) as error:
-            evenly_spaced(contour, n)
-        assert_one_line(error)
 
 
 # --- ground

@@ -151,6 +151,16 @@ class Characteristics(struct.PyTreeNode):
     curvature_x: Float[Array, "*batch"]  # kappa_x [1/m], convex positive
     curvature_y: Float[Array, "*batch"]  # kappa_y [1/m], convex positive
 
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            slope: ArrayLike,
+            incidence: ArrayLike,
+            curvature_x: ArrayLike,
+            curvature_y: ArrayLike,
+        ) -> None: ...
+
 
 @no_type_check
 class LocalHeightmap(struct.PyTreeNode):
@@ -163,6 +173,10 @@ class LocalHeightmap(struct.PyTreeNode):
     height: Float[Array, "*batch n n"]  # [m]
     cell_size: float = struct.field(pytree_node=False)  # [m]
     displacement: float = struct.field(pytree_node=False)  # delta, towards the approach [m]
+
+    if TYPE_CHECKING:
+
+        def __init__(self, height: ArrayLike, cell_size: float, displacement: float) -> None: ...
 
 
 @no_type_check

@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float
 from scipy import ndimage
 
 from wlplan.checks import check_pile
@@ -110,22 +110,6 @@ def check_accessible(accessible: Bool[np.ndarray, " n"]) -> None:
             "A bucket can start nowhere on the toe of this pile: it lies on unseen ground or at "
             "the edge of the map; scan a wider area around the pile."
         )
-
-
-def evenly_spaced(contour: ToeContour, n: int) -> Int[np.ndarray, " n"]:
-    """Indices of `n` accessible points of a contour, evenly spaced along its accessible part.
-
-    Raises:
-        InputError: If the contour has fewer than `n` accessible points.
-    """
-    candidates = np.flatnonzero(contour.accessible)
-    if not 1 <= n <= candidates.size:
-        raise InputError(
-            f"{n} dig locations asked for, but the toe has {candidates.size} accessible points: "
-            f"ask for 1 to {candidates.size}."
-        )
-    chosen: np.ndarray = candidates[((np.arange(n) + 0.5) * candidates.size / n).astype(int)]
-    return chosen
 
 
 def edge_poses(contour: ToeContour, locations: int) -> Pose:

@@ -18,8 +18,8 @@ from wlplan.engines.dem.packing import Bed, Walls, cut, in_lane
 from wlplan.site.machine import WheelLoader
 from wlplan.site.soil import Soil
 
-# Steps of the engine between two of the machine, at the time step of gravel and the size of grain.
-_STEPS, _CONTROL = 10, 4e-3
+# Time between two steps of the machine [s]: ten of the engine's, at gravel and the usual grain.
+_CONTROL = 4e-3
 # Rest after cutting and after digging: time with drag, drag [N s/m], time without.
 _AFTER_CUT, _AFTER_DIG, _DRAG = (0.15, 0.35), (0.02, 0.60), 60.0
 # What counts as in the bucket, in its own frame: from a little behind its back to a heap over its
@@ -163,7 +163,7 @@ def _dig(engine: Engine, loader: Loader, plates: np.ndarray) -> np.ndarray:
     while not loader.is_free:
         place = (loader.position, loader.boom, loader.tilt)
         pin_x, pin_z = loader.linkage.pin(*place[:2])
-        # The moment about the pin in place of that about the origin.
+        # The moment about the pin instead of that about the origin.
         moment = force[2] - (pin_x * force[1] - pin_z * force[0])
         loader.advance(Reaction(float(force[0]), float(force[1]), float(moment)))
         if not rows or loader.record[0] - rows[-1][0] > _RECORDED_EVERY:

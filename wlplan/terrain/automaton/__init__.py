@@ -5,8 +5,8 @@ f * max(h_i - h_k - d tan(repose), 0) from the higher to the lower cell (eight n
 flow is antisymmetric, so volume is kept by construction; with f = 1/8 the Jacobian of a sweep is
 symmetric, not negative and has unit row sums, so a sweep is monotone, non-expansive in every
 p-norm, and its gradient cannot explode. This is our reading of the mass-preserving automaton of
-Pla-Castells et al. (2004), which the paper employs (section 4.6), with eight neighbours in place
-of four. `sweeps` and `converged` are this automaton as it stands.
+Pla-Castells et al. (2004), which the paper employs (section 4.6), with eight neighbours instead of
+four. `sweeps` and `converged` are this automaton as it stands.
 
 Sweeps alone take thousands to bring a bucket's hole to rest. `settle` gets there in dozens:
 
@@ -24,20 +24,17 @@ count as constants.
 """
 
 from wlplan.terrain.automaton.flow import FLOW_FRACTION, converged, sweep, sweeps
-from wlplan.terrain.automaton.relaxation import Settled, relax, settle, settle_dug
+from wlplan.terrain.automaton.relaxation import relax, settle, settle_dug
 from wlplan.terrain.automaton.rounds import DEFAULT_SCHEDULE, Schedule
 from wlplan.terrain.automaton.slopes import movable, steepest_slope
-from wlplan.terrain.automaton.windows import WINDOW, pad_pile, window_of
+from wlplan.terrain.automaton.windows import window_of
 
 __all__ = [
     "DEFAULT_SCHEDULE",
     "FLOW_FRACTION",
-    "WINDOW",
     "Schedule",
-    "Settled",
     "converged",
     "movable",
-    "pad_pile",
     "relax",
     "settle",
     "settle_dug",
