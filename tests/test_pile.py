@@ -49,38 +49,13 @@ def assert_one_line(error):
     assert len(str(error.value)) > 20
 
 
-# --- volume
+# --- floor
 
 
-def test_volume_of_a_cone():
-    want = math.pi * 3.0 * (3.0 / math.tan(SLOPE)) ** 2 / 3.0
-    assert volume(pile_of(np.maximum(cone(*grid()), 0.0))) == pytest.approx(want, rel=0.01)
-
-
-def test_volume_counts_from_the_ground():
+def test_without_a_ground_the_floor_is_at_level_zero():
     height = np.full((50, 60), 2.0)
-    assert volume(pile_of(height, ground=height - 0.5)) == pytest.approx(0.5 * 50 * 60 * 0.01)
+    np.testing.assert_allclose(pile_of(height, ground=height - 0.5).floor, 1.5)
     assert not pile_of(height).floor.any()
-
-
-def test_volume_under_jit_and_vmap_equals_one_by_one():
-    piles = [seed_pile("conical", slope=SLOPE, seed=seed) for seed in range(3)]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *piles)
-    one_by_one = np.array([volume(pile) for pile in piles])
-    np.testing.assert_allclose(jax.jit(jax.vmap(volume))(batch), one_by_one, rtol=1e-6)
-
-
-def test_the_gradient_of_the_volume_is_the_cell_area():
-    pile = seed_pile("wedge", slope=SLOPE)
-    gradient = jax.grad(lambda height: volume(pile.replace(height=height)))(pile.height)
-    np.testing.assert_allclose(gradient, 0.01, rtol=1e-6)
-
-
-def test_volume_in_float64():
-    with jax.enable_x64(True):
-        pile = seed_pile("conical", slope=SLOPE)
-        assert pile.height.dtype == jnp.float64
-        assert volume(pile).dtype == jnp.float64
 
 
 # --- seed piles
