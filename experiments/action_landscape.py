@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from experiments.record import main
-from experiments.replays import in_batches
+from experiments._common.resimulation import resimulate
+from experiments._common.results import main
 from wlplan.constants import ACTION_HIGH, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 from wlplan.engines.simulator import Settings, dig
 from wlplan.io import write_bytes_atomic
@@ -86,7 +86,7 @@ def run(preset: str) -> dict[str, Any]:
     actions = np.concatenate([np.tile(BOOM, (len(grid), 1)), grid], axis=1)
     shapes = SHAPES | APART
     surfaces = np.array([surface(*shape) for shape in shapes.values()])
-    cycle = in_batches(
+    cycle = resimulate(
         lambda *inputs: dig(*inputs, settings=Settings()).replace(height=0.0),
         np.repeat(surfaces, len(grid), axis=0),
         np.tile(actions, (len(surfaces), 1)),

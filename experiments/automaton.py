@@ -7,7 +7,7 @@ import functools
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.record import main
+from experiments._common.results import main
 from wlplan.constants import CELL_SIZE
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
@@ -155,7 +155,7 @@ def _judged(
         found.append(np.asarray(after.height, np.float64))
         seconds.append(min(spent))
     errors = [_error(dig, h, r) for dig, h, r in zip(digs, found, references, strict=True)]
-    row = {
+    row: dict[str, Any] = {
         "name": name,
         "sweeps": None if schedule is None else schedule.sweeps,
         "momentum": 0.0 if schedule is None else schedule.momentum,
@@ -189,7 +189,7 @@ def _rounds(digs: list[Dig], schedule: Schedule) -> list[int]:
     return counts
 
 
-def _spread(values: list[float]) -> dict[str, float]:
+def _spread(values: Sequence[float]) -> dict[str, float]:
     low, median, high = (float(v) for v in np.percentile(values, (10, 50, 90)))
     return {
         "median": median,
@@ -234,7 +234,7 @@ def _profile(dig: Dig, reference: np.ndarray) -> dict[str, list[float]]:
 
 
 _ORANGE, _BLUE, _GREY, _INK = "#d97a1f", "#1f5fa8", "#8a8a8a", "#1d2733"
-_STYLES = {
+_STYLES: dict[str, dict[str, Any]] = {
     "before": {"color": _GREY, "ls": "-"},
     "converged": {"color": _BLUE, "ls": "-", "lw": 3.0},
     "settled": {"color": _ORANGE, "ls": "--", "lw": 1.8},
@@ -245,6 +245,7 @@ _STYLES = {
 def draw(folder: Path) -> None:
     """A profile through one dig, the errors of all, and what each ingredient gains."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     result = json.loads((folder / "automaton.json").read_text())
     figure = Figure(figsize=(8.4, 6.0), layout="constrained")
@@ -254,9 +255,11 @@ def draw(folder: Path) -> None:
     (default,) = (row for row in result["rows"] if row["name"] == "default")
     centimetres = 100.0 * np.array(default["errors"])
     panel = panels["errors"]
-    panel.hist(centimetres, bins=np.linspace(0.0, centimetres.max(), 25), color=_ORANGE)
+    panel.hist(centimetres, bins=np.linspace(0.0, centimetres.max(), 25).tolist(), color=_ORANGE)
     panel.axvline(np.median(centimetres), color=_INK, ls="--", label="median")
-    panel.yaxis.get_major_locator().set_params(integer=True)
+    locator = panel.yaxis.get_major_locator()
+    assert isinstance(locator, MaxNLocator)
+    locator.set_params(integer=True)
     panel.set_xlim(0.0)
     panel.set_xlabel("mean error where disturbed [cm]")
     panel.set_ylabel("digs")

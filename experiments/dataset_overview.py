@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from experiments.record import described, main
-from experiments.replays import in_batches, surfaces
+from experiments._common.resimulation import initial_surfaces, resimulate
+from experiments._common.results import dataset_summary, main
 from wlplan.constants import J_PER_KJ, KG_PER_TONNE
 from wlplan.dataset import Dataset
 from wlplan.engines.simulator import dig
@@ -61,7 +61,7 @@ def run(preset: str, data: Dataset) -> dict[str, Any]:
     data = data.select(data.valid)
     outcomes, shape = _outcomes(data), _shape(data)
     return {
-        "data": described(data),
+        "data": dataset_summary(data),
         "stop_reasons": np.bincount(data.stop_reason, minlength=4).tolist(),
         "ranges": {name: _range(name, values) for name, values in outcomes.items()},
         "shape_ranges": {name: _percentiles(values) for name, values in shape.items()},
@@ -168,17 +168,17 @@ def _faster(data: Dataset, count: int) -> dict[str, Any]:
     """The same cycles with a machine that drives, or does everything, slower and faster."""
     random = np.random.default_rng(SEED)
     some = data.select(random.choice(len(data), min(count, len(data)), replace=False))
-    surface = surfaces(some)
+    surface = initial_surfaces(some)
     result: dict[str, Any] = {"cycles": len(some)}
-    played: dict[WheelLoader, tuple[np.ndarray, ...]] = {}
+    simulated: dict[WheelLoader, tuple[np.ndarray, ...]] = {}
     for name, fields in SPEEDS.items():
         rows = []
         for factor in FACTORS:
             scaled = {field: factor * getattr(WA320, field) for field in fields}
             machine = dataclasses.replace(WA320, **scaled)
-            if machine not in played:
-                played[machine] = _played(machine, surface, some.action)
-            rows.append(played[machine])
+            if machine not in simulated:
+                simulated[machine] = _simulate(machine, surface, some.action)
+            rows.append(simulated[machine])
         mass, time, work, fill = (np.array(column) for column in zip(*rows, strict=True))
         each = {
             "productivity": 60.0 * mass / time,
@@ -204,7 +204,7 @@ def _faster(data: Dataset, count: int) -> dict[str, Any]:
             for k, factor in enumerate(FACTORS)
         ]
         if name == "drive":
-            # The stored maps do not tell the height of the floor exactly: what that does.
+            # The maps of the data set do not give the height of the floor exactly: what that does.
             error = np.abs(mass[own] - some.mass)
             result["replayed_mass_error"] = {
                 "median": float(np.median(error)),
@@ -213,11 +213,11 @@ def _faster(data: Dataset, count: int) -> dict[str, Any]:
     return result
 
 
-def _played(
+def _simulate(
     machine: WheelLoader, surface: np.ndarray, action: np.ndarray
 ) -> tuple[np.ndarray, ...]:
     """Mass [t], time [s], work [kJ] and time of filling [s] with a machine."""
-    cycle = in_batches(
+    cycle = resimulate(
         lambda *inputs: dig(*inputs, machine=machine).replace(height=0.0), surface, action
     )
     work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip

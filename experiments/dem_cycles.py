@@ -1,4 +1,4 @@
-"""Loading cycles played by the discrete-element engine: the recipe of a reference data set.
+"""Loading cycles simulated by the discrete-element engine: the recipe of a reference data set.
 
 Piles are planes, cones and wedges of 20 to 30 degrees with low bumps; each is dug twice, the second
 time where the first loading left its toe. Every cycle is drawn from the seed and its own number, so
@@ -45,9 +45,9 @@ _WAVES, _WAVE_NUMBER, _FULL = 6, 1.6, 0.5
 # The second loading begins this far before the pile is as high as a toe, on average over the
 # bucket's width [m].
 _BEFORE_TOE, _TOE = 0.15, 0.15
-# Maps are stored as multiples of this [m].
+# Maps are saved as multiples of this [m].
 _UNIT = 1e-3
-# Longest record of a cycle that is stored, in rows of 0.04 s.
+# Longest record of a cycle that is saved, in rows of 0.04 s.
 _ROWS = 640
 
 
@@ -114,7 +114,7 @@ def next_cycle(
     Args:
         seed: Of the whole file.
         number: Of the cycle.
-        repeats: 0 for two loadings of each pile; otherwise every first loading is played with so
+        repeats: 0 for two loadings of each pile; otherwise every first loading is simulated with so
             many packings.
         done: Rows of the cycles before.
     """
@@ -181,8 +181,8 @@ def read_rows(path: Path, recipe: dict[str, Any]) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
-            columns_of = {name: stored[name] for name in stored}
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+            columns_of = {name: archive[name] for name in archive}
         begun = json.loads(str(columns_of["recipe"]))
     except (OSError, ValueError, KeyError) as error:
         raise InputError(
@@ -230,7 +230,7 @@ def write_rows(path: Path, rows: Sequence[dict[str, Any]], recipe: dict[str, Any
 
 
 def collect(path: Path, *, seed: int, cycles: int, repeats: int, machine: str) -> int:
-    """Plays cycles until a file has as many as are wanted; tells stderr of each.
+    """Simulates cycles until a file has as many as are wanted; a line on stderr for each.
 
     Args:
         path: File to begin or to go on with.
@@ -240,10 +240,10 @@ def collect(path: Path, *, seed: int, cycles: int, repeats: int, machine: str) -
         machine: A name of `MACHINES`.
 
     Returns:
-        How many were played.
+        How many were simulated.
 
     Raises:
-        InputError: If the engine is missing or fails; what was played is in the file.
+        InputError: If the engine is missing or fails; what was simulated is in the file.
     """
     digs: WheelLoader = MACHINES[machine]
     recipe = {"seed": seed, "repeats": repeats, "machine": dataclasses.asdict(digs)}
@@ -251,10 +251,10 @@ def collect(path: Path, *, seed: int, cycles: int, repeats: int, machine: str) -
     begun = len(rows)
     for number in range(begun, cycles):
         surface, action, packing, origin = next_cycle(seed, number, repeats, rows)
-        played = process.play(
+        cycle = process.play(
             surface, action, machine=digs, soil=GRAVEL, settings=DemSettings(packing=packing)
         )
-        rows.append(row_of(played, action, origin))
+        rows.append(row_of(cycle, action, origin))
         write_rows(path, rows, recipe)
         row = rows[-1]
         sys.stderr.write(
@@ -274,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--repeats",
         type=int,
         default=0,
-        help="packings in which each pile and action is played, instead of two loadings a pile",
+        help="packings in which each pile and action is simulated, instead of two loadings a pile",
     )
     parser.add_argument("--machine", choices=MACHINES, default="reference", help="what digs")
     options = parser.parse_args(arguments)

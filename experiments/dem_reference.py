@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array
 from scipy import ndimage
 
-from experiments.record import main
+from experiments._common.results import main
 from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 from wlplan.engines.simulator import STOP_REASONS, Cycle, dig, terrain
 from wlplan.io import write_bytes_atomic
@@ -68,9 +68,9 @@ _HELD_OUT_COLOUR, _FITTED_COLOUR, _DEM_COLOUR = "#1f5fa8", "#b9c4d0", "#c8641e"
 
 def load(path: Path, count: int | None = None) -> dict[str, np.ndarray]:
     """The first cycles of a file of references."""
-    with np.load(path) as stored:
-        names = [str(name) for name in stored["path_names"]]
-        cycles = {n: stored[n][:count] for n in stored if stored[n].ndim and n != "path_names"}
+    with np.load(path) as archive:
+        names = [str(name) for name in archive["path_names"]]
+        cycles = {n: archive[n][:count] for n in archive if archive[n].ndim and n != "path_names"}
     for name in ("h0_cg", "h1_cg"):
         cycles[name] = cycles[name].astype(np.float32) / 1000.0
     record = cycles.pop("path")
@@ -109,7 +109,8 @@ def slid(height: Array) -> np.ndarray:
 
 def misplaced(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Volume between two surfaces [m^3]."""
-    return np.abs(one - other).sum(axis=(-2, -1)) * CELL_SIZE**2
+    volume: np.ndarray = np.abs(one - other).sum(axis=(-2, -1)) * CELL_SIZE**2
+    return volume
 
 
 def forces(reference: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -151,13 +152,17 @@ def forces(reference: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             met = terrain.reaction(MACHINE, GRAVEL, height, ground, fill, bucket, wanted)
             return (height, fill, reached), (met.horizontal, met.vertical, met.content_mass)
 
-        return lax.scan(step, (height, fill, path[0, :, 0]), path)[1]
+        loads: tuple[Array, Array, Array]
+        _, loads = lax.scan(step, (height, fill, path[0, :, 0]), path)
+        return loads
 
     horizontal, vertical, content = (np.asarray(v) for v in lead(height, fill, path))
     window = round(_SMOOTHED / _STEP)
 
     def smoothed(values: np.ndarray) -> np.ndarray:
-        return ndimage.uniform_filter1d(values / 1000.0, window, axis=0, mode="nearest")
+        mean: np.ndarray
+        mean = ndimage.uniform_filter1d(values / 1000.0, window, axis=0, mode="nearest")
+        return mean
 
     within = np.arange(longest)[:, None] < count[None]
     return {
@@ -173,8 +178,8 @@ def forces(reference: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _rank_correlation(one: np.ndarray, other: np.ndarray) -> float:
-    ranks = [np.argsort(np.argsort(values)) for values in (one, other)]
-    return float(np.corrcoef(*ranks)[0, 1])
+    first, second = (np.argsort(np.argsort(values)) for values in (one, other))
+    return float(np.corrcoef(first, second)[0, 1])
 
 
 def _agreement(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:

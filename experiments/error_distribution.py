@@ -15,8 +15,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from experiments.record import described, main
-from experiments.trained import PSI, SHIPPED, shipped, shortened, trained
+from experiments._common.models import (
+    PREDICTORS,
+    PRETRAINED,
+    load_or_train,
+    load_pretrained,
+    smoke_settings,
+)
+from experiments._common.results import dataset_summary, main
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
@@ -43,10 +49,12 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     test = split(data)[2]
     test = test.select(test.valid & (test.mass > 0.0))
     compared: dict[str, Any] = {
-        title: trained(models, data, shortened(PSI[title]) if smoke else PSI[title])[0]
+        title: load_or_train(
+            models, data, smoke_settings(PREDICTORS[title]) if smoke else PREDICTORS[title]
+        )[0]
         for title in MODELS
     }
-    compared |= {title: shipped(kind)[0] for title, kind in SHIPPED.items()}
+    compared |= {title: load_pretrained(kind)[0] for title, kind in PRETRAINED.items()}
     errors, stalls = {}, {}
     for title, model in compared.items():
         predicted = predict(model, test)
@@ -57,7 +65,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
         stalls[title] = _by_stall(test.time, np.asarray(predicted.time), errors[title])
     worst = np.argsort(-np.abs(errors[MODELS[0]]["mass"]))[:WORST]
     return {
-        "data": described(data),
+        "data": dataset_summary(data),
         "cycles": len(test),
         "simulated": {
             name: [float(f"{value:.4g}") for value in getattr(test, name)] for name in OUTCOMES
@@ -172,8 +180,8 @@ def draw(folder: Path) -> None:
         tidy(panel)
         if name == "mass":
             panel.legend(fontsize=8, frameon=False, loc="upper right")
-    told = "grey: distribution of the cycles; errors above 40 % not shown"
-    figure.suptitle(f"{result['cycles']} held-out cycles; {told}", fontsize=8, color=FAINT)
+    note = "grey: distribution of the cycles; errors above 40 % not shown"
+    figure.suptitle(f"{result['cycles']} held-out cycles; {note}", fontsize=8, color=FAINT)
     write_bytes_atomic(folder / "error_distribution.png", png_bytes(figure))
     _draw_worst(result, folder)
 

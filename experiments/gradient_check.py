@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import wlplan
-from experiments.record import main
+from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.job import make_job
 from wlplan.report.figures import png_bytes

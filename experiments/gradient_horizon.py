@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import wlplan
-from experiments.record import main
+from experiments._common.results import main
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.job import Decisions, Job, make_job, outcomes, with_toe
@@ -101,6 +101,7 @@ def _memory(job: Job, plan: LoadingPlan, loads: int) -> dict[str, Any]:
     """Temporary memory that forward and backward pass of one plan need at most, as compiled."""
     one = jax.tree.map(lambda leaf: leaf[0, :loads], plan)
     analysis = jax.jit(cost_and_gradient).lower(job, one).compile().memory_analysis()
+    assert analysis is not None, "this backend does not say how much memory it takes"
     return {
         "loads": loads,
         "precision": str(one.pose.x.dtype),

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.record import described, main
-from experiments.trained import shipped, shortened, trained
+from experiments._common.models import load_or_train, load_pretrained, smoke_settings
+from experiments._common.results import dataset_summary, main
 from wlplan.constants import QUANTITIES
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
@@ -47,7 +47,9 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
                 part, epochs = (data, EPOCHS) if size is None else _part(pool, size, seed)
                 # As the models of `experiments.performance`, which need not be trained again.
                 settings = KINDS[kind](seed=seed, epochs=epochs)
-                model, _ = trained(models, part, shortened(settings) if smoke else settings)
+                model, _ = load_or_train(
+                    models, part, smoke_settings(settings) if smoke else settings
+                )
                 report = evaluate_performance(model, test).every.mean_relative
                 each.append([report[name] for name in NAMES])
             values = np.array(each)
@@ -60,7 +62,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
                 }
             )
     return {
-        "data": described(data),
+        "data": dataset_summary(data),
         "held_out": len(test),
         "models": rows,
         "ships": {kind: _shipped(kind, test) for kind in MODELS},
@@ -74,7 +76,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
 
 def _shipped(kind: str, test: Dataset) -> dict[str, Any]:
     """Cycles and errors of a model that ships."""
-    model, description = shipped(kind)
+    model, description = load_pretrained(kind)
     report = evaluate_performance(model, test)
     return {
         "cycles": sum(description["training"]["cycles"][:2]),

@@ -18,7 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from experiments.record import described, main
+from experiments._common.models import (
+    PREDICTORS,
+    PRETRAINED,
+    load_or_train,
+    load_pretrained,
+    smoke_settings,
+)
+from experiments._common.results import dataset_summary, main
 from experiments.simulator_gradients import (
     LINE,
     LINE_KIND,
@@ -34,7 +41,6 @@ from experiments.simulator_gradients import (
     replayed,
     site_of_the_line,
 )
-from experiments.trained import PSI, SHIPPED, shipped, shortened, trained
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
 from wlplan.io import write_bytes_atomic
@@ -58,7 +64,7 @@ PARTS = {
 # and a tenth of an action's range): the derivative; 1 cm and 0.1 % of the range; 10 cm and 1 %;
 # 0.5 m, 3 degrees and 5 %, about as far as a planner moves.
 STEPS = {"1e-6": 1e-6, "0.01": 1e-2, "0.1": 1e-1, "0.5": 0.5}
-MODELS = tuple(title for title in PSI if "of the paper" not in title)
+MODELS = tuple(title for title in PREDICTORS if "of the paper" not in title)
 COLOURS = {"swish": BLUE, "leaky relu": ORANGE, "as it ships": GREEN}
 
 
@@ -66,10 +72,12 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     """Cosines between the models' gradients and the simulator's differences, and the line."""
     smoke = preset == "smoke"
     chosen = {
-        title: trained(models, data, shortened(PSI[title]) if smoke else PSI[title])[0]
+        title: load_or_train(
+            models, data, smoke_settings(PREDICTORS[title]) if smoke else PREDICTORS[title]
+        )[0]
         for title in MODELS
     }
-    chosen |= {title: shipped(kind)[0] for title, kind in SHIPPED.items()}
+    chosen |= {title: load_pretrained(kind)[0] for title, kind in PRETRAINED.items()}
     with jax.enable_x64(True):
         cases = random_cases(1 if smoke else ROLLOUTS, 2 if smoke else LOADS)
         differences = _differences(cases)
@@ -84,7 +92,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
             if step != "1e-6"
         }
         return {
-            "data": described(data),
+            "data": dataset_summary(data),
             "cycles": len(cases[0]),
             "step_units": UNITS.tolist(),
             "steps": STEPS,

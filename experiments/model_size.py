@@ -16,9 +16,9 @@ import jax
 import numpy as np
 from flax import nnx
 
+from experiments._common.models import load_or_train, smoke_settings
+from experiments._common.results import dataset_summary, main
 from experiments.learning_curve import MODELS
-from experiments.record import described, main
-from experiments.trained import shortened, trained
 from wlplan.constants import QUANTITIES
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
@@ -42,9 +42,9 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     rows = []
     for kind, count, each in itertools.product(MODELS, layers, units):
         settings = KINDS[kind](epochs=EPOCHS)
-        settings = shortened(settings) if smoke else settings
+        settings = smoke_settings(settings) if smoke else settings
         settings = dataclasses.replace(settings, hidden=(each,) * count)
-        model, seconds = trained(models, data, settings)
+        model, seconds = load_or_train(models, data, settings)
         one, batch = performance_times(model, test)
         rows.append(
             {
@@ -59,7 +59,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
             }
         )
     return {
-        "data": described(data),
+        "data": dataset_summary(data),
         "batch": batch.inputs,
         "rows": rows,
         "paper": {

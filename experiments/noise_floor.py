@@ -30,9 +30,15 @@ from jaxtyping import Array, Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from experiments.record import described, main
-from experiments.replays import in_batches, surfaces
-from experiments.trained import PSI, SHIPPED, shipped, shortened, trained
+from experiments._common.models import (
+    PREDICTORS,
+    PRETRAINED,
+    load_or_train,
+    load_pretrained,
+    smoke_settings,
+)
+from experiments._common.resimulation import initial_surfaces, resimulate
+from experiments._common.results import dataset_summary, main
 from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE, QUANTITIES
 from wlplan.dataset import LOADS, Dataset, split
 from wlplan.engines.simulator import dig
@@ -61,7 +67,7 @@ AROUND, AROUND_LENGTH, TRANSITION = 0.1, 0.5, 0.4
 
 
 def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
-    """Plays the repeats, and sets the errors of the models on the same loadings beside."""
+    """Simulates the repeats, and sets the errors of the models on the same loadings beside."""
     smoke = preset == "smoke"
     cycles, repeats = (6, 3) if smoke else (CYCLES, REPEATS)
     test = split(data)[2]
@@ -69,32 +75,37 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     random = np.random.default_rng(SEED)
     chosen = test.select(np.sort(random.permutation(len(test))[:cycles]))
     predictors = {
-        title: trained(models, data, shortened(PSI[title]) if smoke else PSI[title])[0]
+        title: load_or_train(
+            models, data, smoke_settings(PREDICTORS[title]) if smoke else PREDICTORS[title]
+        )[0]
         for title in MODELS
     }
-    predictors |= {title: shipped(kind)[0] for title, kind in SHIPPED.items()}
+    predictors |= {title: load_pretrained(kind)[0] for title, kind in PRETRAINED.items()}
     truth = np.stack([getattr(chosen, name) for name in NAMES], axis=1).astype(np.float64)
     others = _alike(chosen, data, repeats)
-    variants = {kind: change(surfaces(chosen), repeats, random) for kind, change in CHANGES.items()}
-    variants["same characteristics"] = surfaces(others).reshape(cycles, repeats, *SHAPE)
-    variants["again"] = surfaces(chosen)[:, None]
-    played = _played(variants, chosen.action)
-    again = played.pop("again")[:, 0]
-    played["same characteristics"] *= _excess(predictors["psi_low, swish"], chosen, others)
-    floors = {kind: floor(values) for kind, values in played.items()}
+    variants = {
+        kind: change(initial_surfaces(chosen), repeats, random) for kind, change in CHANGES.items()
+    }
+    variants["same characteristics"] = initial_surfaces(others).reshape(cycles, repeats, *SHAPE)
+    variants["again"] = initial_surfaces(chosen)[:, None]
+    simulated = _simulate(variants, chosen.action)
+    again = simulated.pop("again")[:, 0]
+    simulated["same characteristics"] *= _excess(predictors["psi_low, swish"], chosen, others)
+    floors = {kind: floor(values) for kind, values in simulated.items()}
     errors = {}
     for title, model in predictors.items():
         predicted = predict(model, chosen)
         guess = np.stack([np.asarray(getattr(predicted, name)) for name in NAMES], axis=1)
         errors[title] = (np.abs(guess - truth) / truth).mean(axis=0)
     return {
-        "data": described(data),
+        "data": dataset_summary(data),
         "cycles": cycles,
         "repeats": repeats,
         "largest_change_when_played_again": _named(np.abs(again / truth - 1.0).max(axis=0)),
         "floor": {kind: _named(values) for kind, values in floors.items()},
         "median_deviation": {
-            kind: _named(np.median(_deviations(values), axis=0)) for kind, values in played.items()
+            kind: _named(np.median(_deviations(values), axis=0))
+            for kind, values in simulated.items()
         },
         "error": {title: _named(values) for title, values in errors.items()},
         "error_over_floor": {
@@ -114,7 +125,8 @@ def _deviations(repeats: Float[np.ndarray, "n r 3"]) -> Float[np.ndarray, "n 3"]
     found, constant = repeats[:, :, None], repeats[:, None]
     relative = np.abs(found - constant) / np.maximum(found, 1e-3)
     count = repeats.shape[1]
-    return relative.mean(axis=1).min(axis=1) * np.sqrt(count / (count - 1.0))
+    deviations: np.ndarray = relative.mean(axis=1).min(axis=1) * np.sqrt(count / (count - 1.0))
+    return deviations
 
 
 def floor(repeats: Float[np.ndarray, "n r 3"]) -> Float[np.ndarray, "3"]:
@@ -123,10 +135,11 @@ def floor(repeats: Float[np.ndarray, "n r 3"]) -> Float[np.ndarray, "3"]:
     Args:
         repeats: Mass, time and work of R repeats of each of n loadings.
     """
-    return _deviations(repeats).mean(axis=0)
+    mean: np.ndarray = _deviations(repeats).mean(axis=0)
+    return mean
 
 
-def _played(
+def _simulate(
     variants: dict[str, Float[np.ndarray, "n r 52 52"]], action: Float[np.ndarray, "n 4"]
 ) -> dict[str, Float[np.ndarray, "n r 3"]]:
     """Mass, time and work of loadings on several surfaces each, of several kinds."""
@@ -139,7 +152,7 @@ def _played(
     # All at once, so that it is compiled once.
     rows = np.concatenate([v.reshape(-1, *SHAPE).astype(np.float32) for v in variants.values()])
     actions = np.concatenate([np.repeat(action, v.shape[1], axis=0) for v in variants.values()])
-    values = np.stack(in_batches(outcomes, rows, actions), axis=-1).astype(np.float64)
+    values = np.stack(resimulate(outcomes, rows, actions), axis=-1).astype(np.float64)
     ends = np.cumsum([v.shape[0] * v.shape[1] for v in variants.values()])[:-1]
     return {
         kind: part.reshape(*variants[kind].shape[:2], 3)
@@ -172,13 +185,15 @@ def _excess(model: PerformanceModel | Ensemble, chosen: Dataset, others: Dataset
         return np.stack([np.asarray(getattr(predicted, name), np.float64) for name in NAMES], -1)
 
     own = expected(np.repeat(chosen.characteristics, repeats, axis=0))
-    return (own / expected(others.characteristics)).reshape(len(chosen), repeats, 3)
+    ratio: np.ndarray = own / expected(others.characteristics)
+    return ratio.reshape(len(chosen), repeats, 3)
 
 
 def _faded(surface: np.ndarray, repeats: int, change: np.ndarray) -> np.ndarray:
     """Several surfaces for each one: changes that fade out towards the floor."""
     many = np.broadcast_to(surface[:, None], (len(surface), repeats, *surface.shape[1:]))
-    return many + np.clip(many / FADE, 0.0, 1.0) * change
+    faded: np.ndarray = many + np.clip(many / FADE, 0.0, 1.0) * change
+    return faded
 
 
 def _rough(size: float) -> Callable[[np.ndarray, int, np.random.Generator], np.ndarray]:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.record import described, main
-from experiments.trained import PSI, shortened, trained
+from experiments._common.models import PREDICTORS, load_or_train, smoke_settings
+from experiments._common.results import dataset_summary, main
 from wlplan.constants import QUANTITIES
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
@@ -33,13 +33,13 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     smoke = preset == "smoke"
     test = split(data)[2]
     rows: dict[str, Any] = {}
-    for name, settings in PSI.items():
+    for name, settings in PREDICTORS.items():
         papers = name.startswith("psi_high of the paper")
         seeds = SEEDS_OF_THE_PAPERS if papers or smoke else SEEDS
         errors, times = [], []
         for seed in range(seeds):
-            chosen = dataclasses.replace(shortened(settings) if smoke else settings, seed=seed)
-            model, seconds = trained(models, data, chosen)
+            chosen = dataclasses.replace(smoke_settings(settings) if smoke else settings, seed=seed)
+            model, seconds = load_or_train(models, data, chosen)
             times.append(seconds)
             report = evaluate_performance(model, test)
             errors.append(
@@ -64,17 +64,17 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
             },
         }
     low, high = (np.array(rows[f"psi_{k}, swish"]["every"]["each"]) for k in ("low", "high"))
-    less = 1.0 - high.mean(axis=0) / low.mean(axis=0)
+    reduction = 1.0 - high.mean(axis=0) / low.mean(axis=0)
     paper = {
         name: PERFORMANCE[settings.kind, settings.activation]._asdict()
-        for name, settings in PSI.items()
+        for name, settings in PREDICTORS.items()
     }
     return {
-        "data": described(data),
+        "data": dataset_summary(data),
         "loaded_from_t": report.loaded_mass,
         "models": rows,
         "paper": paper,
-        "less_error_with_the_map": dict(zip(NAMES, less.tolist(), strict=True)),
+        "less_error_with_the_map": dict(zip(NAMES, reduction.tolist(), strict=True)),
     }
 
 

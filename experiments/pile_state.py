@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from experiments.record import described, main
-from experiments.trained import shortened, trained
+from experiments._common.models import load_or_train, smoke_settings
+from experiments._common.results import dataset_summary, main
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
@@ -50,7 +50,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     test = test.select(test.valid)
 
     def of(settings: Settings) -> Any:
-        return trained(models, data, shortened(settings) if smoke else settings)[0]
+        return load_or_train(models, data, smoke_settings(settings) if smoke else settings)[0]
 
     papers = of(PhiVaeSettings())
     ours = [of(PhiSettings(seed=seed)) for seed in range(1 if smoke else SEEDS)]
@@ -70,7 +70,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     misplaced = {title: misplaced_volume(maps, test) for title, maps in predicted.items()}
     coded = _reconstructed(papers, test.h52)
     return {
-        "data": described(data),
+        "data": dataset_summary(data),
         "cycles": len(test),
         "models": {
             title: {
@@ -133,7 +133,8 @@ def _sample(
     """Maps of one cycle [cm], every other cell, and what each prediction misplaces."""
 
     def short(height: np.ndarray) -> list[list[int]]:
-        return np.rint(100.0 * height[::2, ::2]).astype(int).tolist()
+        centimetres: list[list[int]] = np.rint(100.0 * height[::2, ::2]).astype(int).tolist()
+        return centimetres
 
     return {
         "of": name,

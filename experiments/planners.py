@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 import wlplan
-from experiments.record import main
+from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.plan import play
 from wlplan.planning.planners import Gradient, Greedy, Nominal
@@ -96,9 +96,9 @@ def draw(folder: Path) -> None:
         panel.plot(costs["model"], places, "o", ms=5, mfc="white", color=BLUE, label="model")
         panel.plot(costs["simulator"], places, "o", ms=5, color=ORANGE, label="simulator")
         for place, pair in zip(places, zip(*costs.values(), strict=True), strict=True):
-            told = ", ".join(f"{cost:.1f}" for cost in pair)
+            label = ", ".join(f"{cost:.1f}" for cost in pair)
             panel.annotate(
-                told, (max(pair), place), (6, 0), textcoords="offset points", va="center", size=7
+                label, (max(pair), place), (6, 0), textcoords="offset points", va="center", size=7
             )
         # Room for what is written beside the last point.
         panel.set_xmargin(0.1)

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scipy.stats import norm
 
-from experiments.record import described, main
-from experiments.trained import shipped
+from experiments._common.models import load_pretrained
+from experiments._common.results import dataset_summary, main
 from wlplan.dataset import Dataset
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
@@ -35,7 +35,7 @@ def run(preset: str, data: Dataset) -> dict[str, Any]:
     del preset  # nothing is trained: it takes seconds
     rows: dict[str, Any] = {}
     for kind in MODELS:
-        ensemble, description = shipped(kind)
+        ensemble, description = load_pretrained(kind)
         part = held_out(data, description)
         part = part.select(part.valid)
         predicted, deviation = predict_with_deviation(ensemble, part)
@@ -43,7 +43,7 @@ def run(preset: str, data: Dataset) -> dict[str, Any]:
         for name in OUTCOMES:
             error = np.asarray(getattr(predicted, name), np.float64) - getattr(part, name)
             rows[kind][name] = reliability(error, np.asarray(getattr(deviation, name), np.float64))
-    return {"data": described(data), "levels": LEVELS, "models": rows}
+    return {"data": dataset_summary(data), "levels": LEVELS, "models": rows}
 
 
 def reliability(

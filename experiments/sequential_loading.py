@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from experiments._common.models import load_or_train, smoke_settings
+from experiments._common.results import dataset_summary, main
 from experiments.error_distribution import STALL
-from experiments.record import described, main
-from experiments.trained import shortened, trained
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
 from wlplan.dataset.protocol import Episode, choose_pose
@@ -51,7 +51,7 @@ COLOURS = dict(zip(WORLDS, (BLUE, FAINT, ORANGE), strict=True))
 
 @dataclasses.dataclass(frozen=True)
 class Sequence:
-    """Loadings on one pile as the simulator played them, and the piles before and after each."""
+    """Loadings on one pile in the simulator, and the piles before and after each."""
 
     kind: int  # number of the seed pile
     origin: Float[np.ndarray, "2"]
@@ -63,7 +63,8 @@ class Sequence:
     @property
     def volumes(self) -> Float[np.ndarray, " n+1"]:
         """Volume of the pile before each loading and after the last [m³]."""
-        return self.heights.sum(axis=(1, 2), dtype=np.float64) * CELL_SIZE**2
+        volumes: np.ndarray = self.heights.sum(axis=(1, 2), dtype=np.float64) * CELL_SIZE**2
+        return volumes
 
 
 @jax.jit
@@ -94,7 +95,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
             "time_error_s": _by_stall(own, truth),
         }
     return {
-        "data": described(data),
+        "data": dataset_summary(data),
         "models": sources,
         "seed": SEED,
         "piles": [sequence.kind for sequence in sequences],
@@ -130,7 +131,7 @@ def learned_worlds(
     if len(worlds) < len(WORLDS):
 
         def of(settings: Settings) -> Any:
-            return trained(models, data, shortened(settings) if smoke else settings)[0]
+            return load_or_train(models, data, smoke_settings(settings) if smoke else settings)[0]
 
         if "low" not in worlds:
             worlds["low"] = LearnedWorld(of(PsiLowSettings()))
@@ -147,7 +148,8 @@ def simulated(number: int, loads: int) -> Sequence:
     episode = Episode(number, SEED, loads, simulator, length=loads)
     episode.reset()
     pile = Pile(episode.height, CELL_SIZE, episode.origin)
-    heights, poses, outcomes = [np.asarray(pile.height)], [], []
+    heights, outcomes = [np.asarray(pile.height)], []
+    poses: list[np.ndarray] = []
     for place, turn, action in zip(episode.place, episode.turn, episode.action, strict=True):
         pose = choose_pose(pile, place, turn)
         if pose is None:
@@ -173,7 +175,7 @@ def predicted(
 
     Args:
         world: The world.
-        sequence: What the simulator played.
+        sequence: What was simulated.
         own_pile: Whether each loading finds the pile that the world itself left, or that of the
             simulator.
 
@@ -203,7 +205,7 @@ def _pose(values: np.ndarray) -> Pose:
 
 
 def _growth(
-    played: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    predictions: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
     truth: Float[np.ndarray, "p n 3"],
     volumes: Float[np.ndarray, "p n+1"],
 ) -> dict[str, Any]:
@@ -212,8 +214,8 @@ def _growth(
     That of the volume is relative to the volume that is left, as in the paper's table.
     """
     sums = np.cumsum(truth, axis=1)
-    errors = np.cumsum([outcomes for outcomes, _, _ in played], axis=1) / sums - 1.0
-    left = np.array([volume for _, volume, _ in played]) / volumes[:, 1:] - 1.0
+    errors = np.cumsum([outcomes for outcomes, _, _ in predictions], axis=1) / sums - 1.0
+    left = np.array([volume for _, volume, _ in predictions]) / volumes[:, 1:] - 1.0
     return {
         name: {
             "last": _summary(values[:, -1]),
@@ -224,10 +226,10 @@ def _growth(
 
 
 def _sizes(
-    played: list[tuple[np.ndarray, np.ndarray, np.ndarray]], truth: Float[np.ndarray, "p n 3"]
+    predictions: list[tuple[np.ndarray, np.ndarray, np.ndarray]], truth: Float[np.ndarray, "p n 3"]
 ) -> dict[str, float]:
     """Sum of the sizes of the loads' errors over the sum of the outcomes, mean over the piles."""
-    errors = np.abs(np.array([outcomes for outcomes, _, _ in played]) - truth).sum(axis=1)
+    errors = np.abs(np.array([outcomes for outcomes, _, _ in predictions]) - truth).sum(axis=1)
     relative = (errors / truth.sum(axis=1)).mean(axis=0)
     return dict(zip(OUTCOMES, relative.tolist(), strict=True))
 
@@ -243,10 +245,10 @@ def _summary(errors: Float[np.ndarray, " p"]) -> dict[str, float]:
 
 
 def _by_stall(
-    played: list[tuple[np.ndarray, np.ndarray, np.ndarray]], truth: Float[np.ndarray, "p n 3"]
+    predictions: list[tuple[np.ndarray, np.ndarray, np.ndarray]], truth: Float[np.ndarray, "p n 3"]
 ) -> dict[str, float]:
     """Error of the time, summed over all piles, by whether simulator or world have a stall [s]."""
-    errors = np.array([outcomes[:, 1] for outcomes, _, _ in played]) - truth[:, :, 1]
+    errors = np.array([outcomes[:, 1] for outcomes, _, _ in predictions]) - truth[:, :, 1]
     stalled = truth[:, :, 1] > STALL
     thought = errors + truth[:, :, 1] > STALL
     parts = {
@@ -266,14 +268,14 @@ def draw(folder: Path) -> None:
     figure = new_figure(11.0, 4.6)
     panels = figure.subplots(2, 4, sharex=True)
     number = np.arange(1, result["loads"] + 1)
-    for row, way in zip(panels, ("growth", "growth_on_the_simulators_pile"), strict=True):
+    for row, kind in zip(panels, ("growth", "growth_on_the_simulators_pile"), strict=True):
         for panel, quantity in zip(row, QUANTITIES, strict=True):
             for name, colour in COLOURS.items():
-                each = 100.0 * np.array(result["worlds"][name][way][quantity]["each"])
+                each = 100.0 * np.array(result["worlds"][name][kind][quantity]["each"])
                 panel.plot(number, each.mean(axis=0), color=colour, label=TITLES[name])
                 low, high = np.percentile(each, [10.0, 90.0], axis=0)
                 panel.fill_between(number, low, high, color=colour, alpha=0.15, lw=0)
-                if way == "growth" and name in SEQUENCE:
+                if kind == "growth" and name in SEQUENCE:
                     theirs, truth = SEQUENCE[name], SEQUENCE["simulator"]
                     ratio = np.divide(getattr(theirs, quantity), getattr(truth, quantity))
                     error = 100.0 * (ratio - 1.0)
@@ -290,8 +292,8 @@ def draw(folder: Path) -> None:
     panels[1, 0].set_ylabel("on the simulator's pile", fontsize=8)
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    told = f"lines: mean over {len(result['piles'])} piles; bands: 10th to 90th percentile"
-    figure.suptitle(told, fontsize=8, color=FAINT)
+    note = f"lines: mean over {len(result['piles'])} piles; bands: 10th to 90th percentile"
+    figure.suptitle(note, fontsize=8, color=FAINT)
     write_bytes_atomic(folder / "sequential_loading.png", png_bytes(figure))
 
 

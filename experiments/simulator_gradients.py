@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import wlplan
-from experiments.record import main
+from experiments._common.results import main
 from wlplan.constants import ACTION_HIGH, ACTION_LOW, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 from wlplan.dataset.protocol import Episode, choose_pose
 from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig
@@ -100,7 +100,9 @@ def _outcomes(
 def _jacobian(height: Array, origin: Array, vector: Array) -> Array:
     """Derivatives [3, 7] by reverse mode."""
     settings = Settings(differentiable=True)
-    return jax.jacrev(lambda vector: _outcomes(settings, height, origin, vector)[0])(vector)
+    jacobian: Array
+    jacobian = jax.jacrev(lambda vector: _outcomes(settings, height, origin, vector)[0])(vector)
+    return jacobian
 
 
 @jax.jit

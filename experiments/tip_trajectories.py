@@ -15,8 +15,8 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.collections import LineCollection
 
-from experiments.record import described, main
-from experiments.replays import in_batches, surfaces
+from experiments._common.resimulation import initial_surfaces, resimulate
+from experiments._common.results import dataset_summary, main
 from wlplan.constants import KG_PER_TONNE
 from wlplan.dataset import Dataset
 from wlplan.engines.simulator import Trajectory, trace
@@ -26,12 +26,12 @@ from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 from wlplan.terrain.heightmap import STATE_CELLS, STATE_DISPLACEMENT, local_axes
 
 SEED = 0
-# Cycles that are played again, those of them that are drawn, and moments that a path is drawn by.
+# Cycles that are simulated again, how many are drawn, and moments that a path is drawn by.
 CYCLES, DRAWN, MOMENTS = 2000, 250, 20
 # The paper's example actions and the slopes of its piles [degrees].
 ACTIONS = ((0.1, 1.0, 0.1, 2.5), (0.5, 1.0, 0.4, 4.0))
 SLOPES = (30.0, 25.0, 20.0, 15.0, 10.0)
-# Every how many moments of the examples are kept.
+# Every how many moments of the examples are shown.
 _EVERY = 3
 # Distances at which heights are compared: their spacing, the first and the end [m].
 _CELL, _ALONG = 0.1, (-0.5, 4.0)
@@ -44,14 +44,14 @@ def run(preset: str, data: Dataset) -> dict[str, Any]:
     random = np.random.default_rng(SEED)
     count = min(16 if smoke else CYCLES, len(data))
     some = data.select(np.sort(random.choice(len(data), count, replace=False)))
-    paths = in_batches(trace, surfaces(some), some.action)
+    paths = resimulate(trace, initial_surfaces(some), some.action)
     filling = [int(np.argmax(phase >= 1)) for phase in paths.phase]
     drawn = np.sort(random.choice(count, min(DRAWN, count), replace=False))
     stop_x = np.array([x[n] for x, n in zip(paths.tip_x, filling, strict=True)])
     stop_z = np.array([z[n] for z, n in zip(paths.tip_z, filling, strict=True)])
     highest = paths.tip_z.max(axis=1)
     return {
-        "data": described(data),
+        "data": dataset_summary(data),
         "cycles": count,
         # What the replay and the data set disagree by [t].
         "largest_mass_error": float(np.abs(paths.mass[:, -1] / KG_PER_TONNE - some.mass).max()),
@@ -102,18 +102,18 @@ def _examples(slopes: tuple[float, ...]) -> list[dict[str, Any]]:
     rise = np.maximum(along, 0.0)[:, None] * np.ones(STATE_CELLS)
     cases = [(slope, action) for slope in slopes for action in ACTIONS]
     surface = np.array([math.tan(math.radians(slope)) * rise for slope, _ in cases])
-    paths = in_batches(trace, surface, np.array([action for _, action in cases]))
+    paths = resimulate(trace, surface, np.array([action for _, action in cases]))
     found = []
     for k, (slope, action) in enumerate(cases):
         end = int(np.argmax(paths.phase[k] == 2))
-        kept = np.unique([*range(0, end, _EVERY), end])
+        shown = np.unique([*range(0, end, _EVERY), end])
         found.append(
             {
                 "slope_degrees": slope,
                 "action": action,
                 "mass": round(float(paths.mass[k, -1]) / KG_PER_TONNE, 3),
-                "x": paths.tip_x[k, kept].round(3).tolist(),
-                "z": paths.tip_z[k, kept].round(3).tolist(),
+                "x": paths.tip_x[k, shown].round(3).tolist(),
+                "z": paths.tip_z[k, shown].round(3).tolist(),
             }
         )
     return found
@@ -123,7 +123,7 @@ def draw(folder: Path) -> None:
     """Above the paths of the data set, below the examples with the surfaces they dig."""
     result = json.loads((folder / "tip_trajectories.json").read_text())
     figure = new_figure(12.0, 6.4)
-    upper, lower = np.ravel(figure.subfigures(2, 1, height_ratios=[1.35, 1.0]))
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.35, 1.0])[:, 0]
     every, spread = upper.subplots(1, 2, sharey=True)
     lines = [np.column_stack(path) for path in result["paths"]]
     colours = colormaps["tab20"](np.random.default_rng(SEED).integers(20, size=len(lines)))

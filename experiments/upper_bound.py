@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import wlplan
-from experiments.record import main
+from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.job import Decisions, contour_length, make_job, outcomes, with_toe
 from wlplan.planning.planners import Gradient, Greedy, Nominal
@@ -106,8 +106,8 @@ def draw(folder: Path) -> None:
     figure = Figure(figsize=(5.0, 3.2), layout="constrained")
     axis = figure.subplots()
     history = result["history"]
-    played = np.linspace(0, result["plans_played"], len(history))
-    axis.plot(played, history, color="#1f5fa8", label="local search in the simulator")
+    evaluations = np.linspace(0, result["plans_played"], len(history))
+    axis.plot(evaluations, history, color="#1f5fa8", label="local search in the simulator")
     axis.axhline(result["greedy_in_simulator"], color="#888888", ls="--", label="greedy")
     axis.set_xlabel("plans played in the simulator")
     axis.set_ylabel(f"cost of {result['loads']} loads")

@@ -4,6 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from wlplan.types import Pile
+
+
+def volume(pile: Pile) -> jax.Array:
+    """Volume between the surface and the floor [m^3]; signed, and linear in the height."""
+    return jnp.sum(pile.height - pile.floor, axis=(-2, -1)) * pile.cell_size**2
+
 
 def assert_volume_kept(before, after, *, relative=1e-6):
     """The summed height is the same to `relative` of the total."""

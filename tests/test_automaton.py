@@ -15,7 +15,6 @@ from wlplan.terrain.automaton import (
     Schedule,
     converged,
     movable,
-    pad_pile,
     relax,
     settle,
     settle_dug,
@@ -24,6 +23,7 @@ from wlplan.terrain.automaton import (
     sweeps,
     window_of,
 )
+from wlplan.terrain.automaton.windows import pad_pile
 from wlplan.terrain.excavation import excavate
 from wlplan.types import Pile, Pose
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from laws import volume
 
 from wlplan import cli
 from wlplan.errors import InputError
@@ -25,7 +26,6 @@ from wlplan.studies.bench.rollouts import measure_rollouts
 from wlplan.studies.bench.setup import Item, Measured, Setup
 from wlplan.studies.bench.timing import Timing, compiled, timed
 from wlplan.terrain.automaton import converged, steepest_slope, sweeps
-from wlplan.terrain.volume import volume
 from wlplan.types import Pile
 
 REPOSE = math.radians(32.0)

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 import experiments
-from experiments import action_landscape, dataset_overview, record, simulator_gradients
+from experiments import action_landscape, dataset_overview, simulator_gradients
+from experiments._common import results as record
 from wlplan.terrain.characteristics import as_vector, characteristics
 from wlplan.types import LocalHeightmap
 
 ROOT = Path(__file__).parents[1]
 # What the others share, and the recipe of a data set: none has a result of its own.
-OTHERS = {"record", "replays", "trained", "dem_cycles"}
+OTHERS = {"_common", "dem_cycles"}
 NAMES = sorted(
     module.name
     for module in pkgutil.iter_modules(experiments.__path__)

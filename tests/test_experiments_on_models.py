@@ -15,7 +15,7 @@ from experiments import (
     reliability,
     sequential_loading,
 )
-from experiments.trained import trained
+from experiments._common.models import load_or_train as trained
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import fingerprint
 from wlplan.training import PsiLowSettings

@@ -7,13 +7,13 @@ import os
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from laws import volume
 from scan_files import refused, save
 
 from wlplan import io
 from wlplan.errors import InputError
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import toe_contour
-from wlplan.terrain.volume import volume
 from wlplan.types import Action, LoadingPlan, Performance, Pose
 
 SLOPE = math.radians(30.0)

@@ -2,18 +2,16 @@
 
 import math
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from laws import volume
 
 from wlplan.errors import InputError
 from wlplan.site.machine import WA320
 from wlplan.terrain.floor import estimate_ground, fill_unseen
 from wlplan.terrain.resampling import resample
 from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
-from wlplan.terrain.toe import evenly_spaced, toe_contour
-from wlplan.terrain.volume import volume
+from wlplan.terrain.toe import toe_contour
 from wlplan.types import Pile
 
 CELL = 0.1
@@ -49,38 +47,13 @@ def assert_one_line(error):
     assert len(str(error.value)) > 20
 
 
-# --- volume
+# --- floor
 
 
-def test_volume_of_a_cone():
-    want = math.pi * 3.0 * (3.0 / math.tan(SLOPE)) ** 2 / 3.0
-    assert volume(pile_of(np.maximum(cone(*grid()), 0.0))) == pytest.approx(want, rel=0.01)
-
-
-def test_volume_counts_from_the_ground():
+def test_without_a_ground_the_floor_is_at_level_zero():
     height = np.full((50, 60), 2.0)
-    assert volume(pile_of(height, ground=height - 0.5)) == pytest.approx(0.5 * 50 * 60 * 0.01)
+    np.testing.assert_allclose(pile_of(height, ground=height - 0.5).floor, 1.5)
     assert not pile_of(height).floor.any()
-
-
-def test_volume_under_jit_and_vmap_equals_one_by_one():
-    piles = [seed_pile("conical", slope=SLOPE, seed=seed) for seed in range(3)]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *piles)
-    one_by_one = np.array([volume(pile) for pile in piles])
-    np.testing.assert_allclose(jax.jit(jax.vmap(volume))(batch), one_by_one, rtol=1e-6)
-
-
-def test_the_gradient_of_the_volume_is_the_cell_area():
-    pile = seed_pile("wedge", slope=SLOPE)
-    gradient = jax.grad(lambda height: volume(pile.replace(height=height)))(pile.height)
-    np.testing.assert_allclose(gradient, 0.01, rtol=1e-6)
-
-
-def test_volume_in_float64():
-    with jax.enable_x64(True):
-        pile = seed_pile("conical", slope=SLOPE)
-        assert pile.height.dtype == jnp.float64
-        assert volume(pile).dtype == jnp.float64
 
 
 # --- seed piles
@@ -326,22 +299,6 @@ def test_nothing_to_dig(height, why):
     with pytest.raises(InputError, match="Nothing to dig") as error:
         toe_contour(pile_of(height))
     assert_one_line(error)
-
-
-def test_evenly_spaced_points_are_accessible_and_evenly_spaced():
-    x, y = grid()
-    contour = toe_contour(pile_of(np.maximum(cone(x, y), 0.0), valid=x < 2.0))
-    chosen = evenly_spaced(contour, 20)
-    assert contour.accessible[chosen].all()
-    order = np.cumsum(contour.accessible)[chosen]
-    assert np.ptp(np.diff(order)) <= 1
-    assert len(np.unique(evenly_spaced(contour, int(contour.accessible.sum())))) == (
-        contour.accessible.sum()
-    )
-    for n in (0, int(contour.accessible.sum()) + 1):
-        with pytest.raises(InputError) as error:
-            evenly_spaced(contour, n)
-        assert_one_line(error)
 
 
 # --- ground

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from laws import volume
 from scan_files import points_of, refused, save, write_las, write_ply, write_tif
 
 from wlplan import io
@@ -17,7 +18,6 @@ from wlplan.errors import InputError
 from wlplan.io import readers
 from wlplan.io.readers import find_reader, known_endings, register_reader
 from wlplan.terrain.seed_piles import seed_pile
-from wlplan.terrain.volume import volume
 
 
 @pytest.fixture

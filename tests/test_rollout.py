@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from laws import assert_gradient
+from laws import assert_gradient, volume
 
 import wlplan
 from wlplan.engines.simulator import Simulator
@@ -18,8 +18,7 @@ from wlplan.site.site import Site
 from wlplan.site.soil import GRAVEL
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
-from wlplan.terrain.toe import evenly_spaced, toe_contour
-from wlplan.terrain.volume import volume
+from wlplan.terrain.toe import toe_contour
 from wlplan.types import LoadingPlan, Performance, Pile, Pose, action_from
 
 DENSITY = GRAVEL.density / 1000.0  # [tonne/m^3]
@@ -158,7 +157,8 @@ def cone():
     pile = jax.jit(relax)(seed_pile("conical", slope=math.radians(30.0)))
     contour = toe_contour(pile)
     rng = np.random.default_rng(0)
-    spots = evenly_spaced(contour, 24)[[0, 1, 3, 0, 1]]
+    accessible = np.flatnonzero(contour.accessible)
+    spots = accessible[(np.array([1, 3, 7, 1, 3]) * accessible.size) // 48]
     rows = np.concatenate(
         [
             contour.points[spots] + rng.normal(0.0, 0.03, (5, 2)),

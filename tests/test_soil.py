@@ -10,7 +10,7 @@ import pytest
 from laws import assert_gradient
 
 from wlplan.constants import GRAVITY
-from wlplan.engines.simulator.soil import earthmoving_force
+from wlplan.engines.simulator.soil import least_resistance, wedge_of
 from wlplan.site.soil import GRAVEL, Soil
 
 # Design, section 5: rake 60, external friction 20, internal friction 35 degrees, flat ground.
@@ -46,6 +46,13 @@ def random_cuts():
     rake = rng.uniform(np.maximum(np.radians(12.0), slope), np.radians(80.0))
     friction = np.radians(rng.uniform(15.0, 32.0, 400))
     return rng.uniform(0.02, 1.5, 400), rake, slope, friction
+
+
+def earthmoving_force(depth, rake, slope, *, soil, external_friction=None, surcharge=0.0):
+    """Force on a blade a metre of width [N/m], as the simulator computes it."""
+    friction = soil.steel_friction if external_friction is None else external_friction
+    wedge = wedge_of(depth, rake, slope, friction, soil=soil, surcharge=surcharge)
+    return least_resistance(wedge, soil=soil)
 
 
 run = jax.jit(earthmoving_force, static_argnames=("soil", "surcharge"))

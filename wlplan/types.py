@@ -54,7 +54,7 @@ class Pile(struct.PyTreeNode):
             valid: ArrayLike | list[Any] | None = None,
         ) -> None: ...
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if isinstance(self.origin, tuple | list) and all(
             isinstance(value, int | float | np.number) for value in self.origin
         ):
@@ -84,7 +84,7 @@ class Pose(struct.PyTreeNode):
             heading: ArrayLike | list[Any],
         ) -> None: ...
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _as_arrays(self, "x", "y", "heading")
 
 
@@ -107,7 +107,7 @@ class Action(struct.PyTreeNode):
             k_bk: ArrayLike | list[Any],
         ) -> None: ...
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _as_arrays(self, "delta_bm", "k_bm", "delta_bk", "k_bk")
 
 
@@ -138,7 +138,7 @@ class Performance(struct.PyTreeNode):
             work: ArrayLike | list[Any],
         ) -> None: ...
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _as_arrays(self, "mass", "time", "work")
 
 
@@ -150,6 +150,16 @@ class Characteristics(struct.PyTreeNode):
     incidence: Float[Array, "*batch"]  # alpha [rad], 0 head-on
     curvature_x: Float[Array, "*batch"]  # kappa_x [1/m], convex positive
     curvature_y: Float[Array, "*batch"]  # kappa_y [1/m], convex positive
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            slope: ArrayLike,
+            incidence: ArrayLike,
+            curvature_x: ArrayLike,
+            curvature_y: ArrayLike,
+        ) -> None: ...
 
 
 @no_type_check
@@ -163,6 +173,10 @@ class LocalHeightmap(struct.PyTreeNode):
     height: Float[Array, "*batch n n"]  # [m]
     cell_size: float = struct.field(pytree_node=False)  # [m]
     displacement: float = struct.field(pytree_node=False)  # delta, towards the approach [m]
+
+    if TYPE_CHECKING:
+
+        def __init__(self, height: ArrayLike, cell_size: float, displacement: float) -> None: ...
 
 
 @no_type_check

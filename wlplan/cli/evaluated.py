@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from wlplan.cli.outputs import print_table, titled_table
@@ -97,7 +97,7 @@ def print_errors(
     table = titled_table(title)
     for column in ("", "cycles", "mass", "time", "work"):
         table.add_column(column, justify="left" if not column else "right")
-    kinds = (
+    kinds: tuple[tuple[str, str, Callable[[float, str], str]], ...] = (
         ("mean_relative", "mean relative error", lambda v, unit: f"{100.0 * v:.2f} %"),
         ("mean_absolute", "mean absolute error", lambda v, unit: f"{v:.3g} {unit}"),
         ("total_relative", "error of the sum", lambda v, unit: f"{100.0 * v:+.2f} %"),

@@ -218,7 +218,8 @@ def world_named(
     from wlplan.worlds.library import load_world
 
     if name not in WORLDS:
-        return _outside(name)
+        world: World = _outside(name)
+        return world
     world = load_world(
         name, model=model, pile_state=pile_state, soil=site.soil, machine=site.machine
     )

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import click
 
@@ -25,8 +25,10 @@ PROTOCOLS = ("paper", "corridor", "slow")
 BUNDLED = "bundled"
 """What stands for the pile that ships with the package where a file is asked for."""
 
+# `click.ParamType` takes type arguments from click 8.4 on only.
 
-class Numbers(click.ParamType):
+
+class Numbers(click.ParamType):  # type: ignore[type-arg]
     """Finite numbers with commas between them.
 
     Args:
@@ -79,7 +81,7 @@ class ActionNumbers(Numbers):
         return numbers
 
 
-class WholeNumbers(click.ParamType):
+class WholeNumbers(click.ParamType):  # type: ignore[type-arg]
     """Whole numbers with commas between them.
 
     Args:
@@ -114,7 +116,7 @@ class WholeNumbers(click.ParamType):
         return numbers
 
 
-class ShardNumber(click.ParamType):
+class ShardNumber(click.ParamType):  # type: ignore[type-arg]
     """Which part of a whole, counted from 1, and how many parts there are."""
 
     name = "I/N"
@@ -136,7 +138,7 @@ class ShardNumber(click.ParamType):
         return number, count
 
 
-class NameOrReference(click.ParamType):
+class NameOrReference(click.ParamType):  # type: ignore[type-arg]
     """A name that the package knows, or `package.module:Name` of what somebody else wrote.
 
     Args:
@@ -222,7 +224,7 @@ def _training_option(
     )
 
 
-def _option_type(setting: Setting, default: Any) -> click.ParamType:
+def _option_type(setting: Setting, default: Any) -> click.ParamType[Any]:
     """The click type of a setting, by the type of its default."""
     if setting.choices:
         return click.Choice(setting.choices)
@@ -232,8 +234,11 @@ def _option_type(setting: Setting, default: Any) -> click.ParamType:
         return WholeNumbers(int(setting.least), int(setting.most), setting.entries)
     low = setting.least if setting.above is None else setting.above
     high = setting.most if setting.below is None else setting.below
-    make: Any = click.FloatRange if isinstance(default, float) else click.IntRange
-    return make(low, high, min_open=setting.above is not None, max_open=setting.below is not None)
+    opens = {"min_open": setting.above is not None, "max_open": setting.below is not None}
+    if isinstance(default, float):
+        return click.FloatRange(low, high, **opens)
+    # The bounds of a whole number are whole numbers.
+    return click.IntRange(cast("int | None", low), cast("int | None", high), **opens)
 
 
 def _as_text(value: Any) -> str:

@@ -21,7 +21,6 @@ from wlplan.cli.inputs import (
     world_named,
 )
 from wlplan.cli.options import (
-    OBJECTIVES,
     engine_option,
     loads_option,
     model_options,
@@ -38,6 +37,7 @@ from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.plan_table import print_plan, remark_on_ledger
 from wlplan.cli.progress import Progress, Stopwatch, ready
 from wlplan.constants import QUANTITIES
+from wlplan.planning.objectives import OBJECTIVES
 
 if TYPE_CHECKING:
     from wlplan.types import Performance

@@ -16,11 +16,10 @@ from wlplan.dataset.collecting import collect
 from wlplan.dataset.merging import merge
 from wlplan.dataset.probes import probes_of, simulator_changes
 from wlplan.dataset.protocol import PROTOCOLS
-from wlplan.dataset.store import DATASET_FORMAT, open_dataset
+from wlplan.dataset.store import open_dataset
 from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, fingerprint, join, reflect, split
 
 __all__ = [
-    "DATASET_FORMAT",
     "LOADS",
     "PROTOCOLS",
     "VARIABLES",

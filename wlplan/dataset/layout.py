@@ -42,11 +42,6 @@ class Layout:
             )
 
     @property
-    def episodes(self) -> int:
-        """Number of episodes of the whole, the last perhaps cut short."""
-        return math.ceil(self.cycles / LOADS)
-
-    @property
     def loads(self) -> int:
         """Loadings to simulate of each episode."""
         return min(LOADS, self.cycles)

@@ -50,7 +50,8 @@ def identity(layout: Layout, seed: int, protocol: str, simulator: Simulator) -> 
         "schedule": dataclasses.asdict(simulator.schedule),
         "loads": LOADS,
     }
-    return json.loads(json.dumps(identity))
+    as_written: dict[str, Any] = json.loads(json.dumps(identity))
+    return as_written
 
 
 def is_new(path: Path) -> bool:
@@ -177,7 +178,9 @@ def read_attributes(path: Path) -> dict[str, Any]:
     if not os.path.lexists(path):
         raise InputError(f"{path}: no such data set: check the name, or collect it first.")
     try:
-        attributes = json.loads((path / "zarr.json").read_text("utf-8"))["attributes"]
+        attributes: dict[str, Any] = json.loads((path / "zarr.json").read_text("utf-8"))[
+            "attributes"
+        ]
         found = attributes.get("format")
         if found == DATASET_FORMAT:
             int(attributes["cycles"]), int(attributes["cycles_done"])

@@ -221,7 +221,8 @@ def h36_after(
     change = (h52_after - h52)[
         ..., ahead : ahead + PERFORMANCE_CELLS, aside : aside + PERFORMANCE_CELLS
     ]
-    return h36 + change
+    after: np.ndarray = h36 + change
+    return after
 
 
 def reflect(maps: Float[np.ndarray, "*n i j"]) -> Float[np.ndarray, "*n i j"]:

@@ -129,7 +129,8 @@ def _unpack(simulator: Simulator, states: _States) -> State:
         count = math.prod(leaf.shape[:-1])
         leaves.append(rows[row : row + count].reshape(leaf.shape).astype(leaf.dtype))
         row += count
-    return jax.tree.unflatten(tree, leaves)
+    state: State = jax.tree.unflatten(tree, leaves)
+    return state
 
 
 def _begin(simulator: Simulator, height: Array, action: Action) -> State:

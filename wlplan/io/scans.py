@@ -66,11 +66,11 @@ def real_numbers(name: str, values: Any) -> np.ndarray:
     Raises:
         InputError: If they are no real numbers.
     """
-    values = np.asarray(values)
-    if values.dtype.kind not in "iuf":
-        raise InputError(f"`{name}` holds {values.dtype} values: store real numbers.")
+    numbers: np.ndarray = np.asarray(values)
+    if numbers.dtype.kind not in "iuf":
+        raise InputError(f"`{name}` holds {numbers.dtype} values: store real numbers.")
     with np.errstate(invalid="ignore"):  # a NaN of damaged bytes may be a signalling one
-        return values.astype(np.float64)
+        return numbers.astype(np.float64)
 
 
 def check_size(shape: tuple[int, ...], cell_size: float) -> None:

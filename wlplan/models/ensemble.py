@@ -81,7 +81,8 @@ class Ensemble(struct.PyTreeNode):
             action: As for a call.
         """
         each = self._by_each(lambda member: member.of_view(view, action))
-        return jax.tree.map(lambda values: values.mean(axis=0), each)
+        mean: Performance = jax.tree.map(lambda values: values.mean(axis=0), each)
+        return mean
 
     def of_view_with_deviation(
         self, view: Array, action: Float[Array, "4"]

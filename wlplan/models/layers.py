@@ -209,7 +209,8 @@ def activation_named(name: str) -> Callable[[Array], Array]:
     """
     if name not in ACTIVATIONS:
         raise InputError(f"Unknown activation {name!r}: choose one of {', '.join(ACTIVATIONS)}.")
-    return getattr(nnx, name)
+    function: Callable[[Array], Array] = getattr(nnx, name)
+    return function
 
 
 def soft_clamp(values: Float[Array, "*n"]) -> Float[Array, "*n"]:

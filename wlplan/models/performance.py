@@ -1,11 +1,11 @@
 """What the performance predictors share: their signature and what holds their outputs. Paper, 4.4.
 
-Every ψ is called alike; see `PerformancePredictor`.
+Every ψ is called alike, `ψ(local, action) -> performance`: what a loading yields and costs. The
+local heightmap has 36 × 36 cells; the action is `wlplan.types.action_vector` of one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, ClassVar, no_type_check
 
 import jax
@@ -16,12 +16,6 @@ from jaxtyping import Array, Float
 from wlplan.models.layers import StandardisedMlp
 from wlplan.models.normaliser import Normaliser
 from wlplan.types import LocalHeightmap, Performance
-
-PerformancePredictor = Callable[[LocalHeightmap, Float[Array, "4"]], Performance]
-"""`ψ(local, action) -> performance`: what a loading yields and costs.
-
-The local heightmap has 36 × 36 cells; the action is `wlplan.types.action_vector` of one.
-"""
 
 INPUTS = 8
 """What is known besides the map: the four characteristics, then the four parameters of the action.
@@ -48,7 +42,7 @@ class PerformanceModel(struct.PyTreeNode):
 
     view_variable: ClassVar[str]
 
-    params: nnx.State
+    params: nnx.State[Any, Any]
     inputs: Normaliser  # characteristics [rad, rad, 1/m, 1/m], then action
     outputs: Normaliser  # mass [tonne], time [s], work [kJ]
     graph: nnx.GraphDef[Any] = struct.field(pytree_node=False)

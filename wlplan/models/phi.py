@@ -134,7 +134,7 @@ class HeightChangeModel(struct.PyTreeNode):
 
     conserves_volume: ClassVar[bool] = True
 
-    params: nnx.State
+    params: nnx.State[Any, Any]
     graph: nnx.GraphDef[Any] = struct.field(pytree_node=False)
 
     def __call__(

@@ -153,7 +153,7 @@ class VaePileStateModel(struct.PyTreeNode):
 
     conserves_volume: ClassVar[bool] = False
 
-    params: nnx.State
+    params: nnx.State[Any, Any]
     graph: nnx.GraphDef[Any] = struct.field(pytree_node=False)
     # Whether the map before stays along the edges, see `blended`.
     blend: bool = struct.field(pytree_node=False, default=True)
@@ -203,4 +203,5 @@ class VaePileStateModel(struct.PyTreeNode):
         mean = phi.mean[...]
         unit, low, span = scaled(local.height, mean)
         code, _ = phi.vae.encode(unit)
-        return mean + low + span * phi.vae.decode(change(phi, code, span))
+        after: Array = mean + low + span * phi.vae.decode(change(phi, code, span))
+        return after

@@ -220,7 +220,7 @@ def read_description(
     if not os.path.lexists(directory):
         raise InputError(f"{directory}: no such model: check the name, or train it first.")
     try:
-        description = json.loads((directory / _DESCRIPTION).read_text("utf-8"))
+        description: dict[str, Any] = json.loads((directory / _DESCRIPTION).read_text("utf-8"))
         found, got = description["format"], description["kind"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(

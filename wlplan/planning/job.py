@@ -201,7 +201,8 @@ def contour_length(job: Job) -> Float[Array, ""]:
 
 def stacked(decisions: Sequence[Decisions]) -> Decisions:
     """Several decisions as one, with a new leading axis."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *decisions)
+    together: Decisions = jax.tree.map(lambda *leaves: jnp.stack(leaves), *decisions)
+    return together
 
 
 outcomes = ParallelMap(play_candidate)

@@ -93,8 +93,8 @@ def planner_of(planner: str | Planner, world: World) -> Planner:
             raise InputError(
                 f"unknown planner {planner!r}: choose one of {', '.join(planners.NAMES)}."
             )
-        kind = getattr(planners, planners.class_name(planner))
-        by_trial = getattr(kind, "by_trial", kind)
+        kind: Callable[[], Planner] = getattr(planners, planners.class_name(planner))
+        by_trial: Callable[[], Planner] = getattr(kind, "by_trial", kind)
         return by_trial() if is_differentiable(world) is False else kind()
     if isinstance(planner, type) or not callable(getattr(planner, "propose", None)):
         raise InputError(
@@ -134,13 +134,17 @@ def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> P
 
 def _rows(proposals: Proposals) -> Decisions | LoadingPlan:
     """All that may be picked, leaves [K, N]: the candidates, and the limit as the last."""
+    candidates: Decisions | LoadingPlan
     candidates, limit = proposals
     # The first leaf of either kind is one number a loading.
     if jnp.ndim(jax.tree.leaves(candidates)[0]) == 1:
         candidates = jax.tree.map(lambda leaf: leaf[None], candidates)
     if limit is None:
         return candidates
-    return jax.tree.map(lambda all_, one: jnp.concatenate([all_, one[None]]), candidates, limit)
+    rows: Decisions | LoadingPlan = jax.tree.map(
+        lambda all_, one: jnp.concatenate([all_, one[None]]), candidates, limit
+    )
+    return rows
 
 
 def play(
@@ -195,4 +199,5 @@ def _play_load_by_load(
 
 
 def _member(batch: PlanResult, k: int) -> PlanResult:
-    return jax.tree.map(lambda leaf: leaf[k], batch)
+    member: PlanResult = jax.tree.map(lambda leaf: leaf[k], batch)
+    return member

@@ -36,7 +36,8 @@ def rollout(world: World, pile: Pile, plan: LoadingPlan) -> Rollout:
     check_world(world)
     check_pile(pile)
     check_plan(plan)
-    return _rollout(as_pytree(world), pile, plan)
+    outcome: Rollout = _rollout(as_pytree(world), pile, plan)
+    return outcome
 
 
 @jax.jit

@@ -62,4 +62,5 @@ def diggability_map(
 
 @jax.jit
 def _predict(world: PyTree, pile: Pile, pose: Pose, action: Action) -> Performance:
-    return jax.vmap(lambda one: world(pile, one, action)[1])(pose)
+    predicted: Performance = jax.vmap(lambda one: world(pile, one, action)[1])(pose)
+    return predicted

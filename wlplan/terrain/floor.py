@@ -113,7 +113,8 @@ def _distance(inside: Bool[np.ndarray, "nx ny"], cell_size: float) -> Float[np.n
     """Distance to the nearest cell that is not inside [m]; the map has no edge to be near."""
     if inside.all():
         return np.full(inside.shape, np.inf)
-    return ndimage.distance_transform_edt(inside) * cell_size
+    distance: np.ndarray = ndimage.distance_transform_edt(inside) * cell_size
+    return distance
 
 
 def _lie_of_the_land(
@@ -137,7 +138,10 @@ def _lie_of_the_land(
     if math.hypot(plane[1], plane[2]) * scale / cell_size > math.tan(_STEEPEST_LAND):
         plane = np.array([np.quantile(value, 0.1), 0.0, 0.0])
     grid_i, grid_j = np.indices(surface.shape)
-    return plane[0] + plane[1] * (grid_i * scale - 1.0) + plane[2] * (grid_j * scale - 1.0)
+    land: np.ndarray = (
+        plane[0] + plane[1] * (grid_i * scale - 1.0) + plane[2] * (grid_j * scale - 1.0)
+    )
+    return land
 
 
 def _harmonic(
@@ -179,10 +183,11 @@ def _solve_laplace(
         columns.append(b[both])
     row, column = np.concatenate(rows), np.concatenate(columns)
     links = sparse.coo_array((-np.ones(row.size), (row, column)), shape=(count, count))
-    return linalg.spsolve((links + sparse.diags_array(degree)).tocsc(), known)
+    solution: np.ndarray = linalg.spsolve((links + sparse.diags_array(degree)).tocsc(), known)
+    return solution
 
 
-def _neighbours():
+def _neighbours() -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
     """Pairs of slices that put each cell beside its neighbour on each of the four sides."""
     low, high, every = slice(None, -1), slice(1, None), slice(None)
     pairs = [((low, every), (high, every)), ((every, low), (every, high))]
@@ -194,7 +199,8 @@ def _mean_of_neighbours(values: Float[np.ndarray, "nx ny"]) -> Float[np.ndarray,
     for here, there in _neighbours():
         total[here] += values[there]
         count[here] += 1.0
-    return total / count
+    mean: np.ndarray = total / count
+    return mean
 
 
 def _halve(
@@ -204,8 +210,9 @@ def _halve(
     odd = [(0, n % 2) for n in values.shape]
     shape = [(n + n % 2) // 2 for n in values.shape]
 
-    def total(cells):
-        return np.pad(cells, odd).reshape(shape[0], 2, shape[1], 2).sum(axis=(1, 3))
+    def total(cells: Float[np.ndarray, "nx ny"]) -> Float[np.ndarray, "mx my"]:
+        sums: np.ndarray = np.pad(cells, odd).reshape(shape[0], 2, shape[1], 2).sum(axis=(1, 3))
+        return sums
 
     known = total((~unknown).astype(float))
     return total(np.where(unknown, 0.0, values)) / np.maximum(known, 1.0), known == 0
@@ -219,4 +226,5 @@ def _double(
         np.clip(0.5 * np.arange(n) - 0.25, 0.0, m - 1)
         for n, m in zip(shape, coarse.shape, strict=True)
     )
-    return ndimage.map_coordinates(coarse, np.meshgrid(i, j, indexing="ij"), order=1)
+    fine: np.ndarray = ndimage.map_coordinates(coarse, np.meshgrid(i, j, indexing="ij"), order=1)
+    return fine

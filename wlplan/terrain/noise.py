@@ -54,4 +54,5 @@ def gradient_noise(
 
 
 def _quintic(t: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    return t * t * t * (t * (6.0 * t - 15.0) + 10.0)
+    blend: np.ndarray = t * t * t * (t * (6.0 * t - 15.0) + 10.0)
+    return blend

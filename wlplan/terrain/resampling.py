@@ -6,7 +6,7 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from wlplan.errors import InputError
 from wlplan.types import Pile
@@ -47,9 +47,9 @@ def resample(pile: Pile, cell_size: float) -> Pile:
         for n, m in zip(old, new, strict=True)
     ]
 
-    def regrid(values):
-        values = np.asarray(values, dtype=np.float64)
-        return _regrid_rows(_regrid_rows(values, centres[0], ratio).T, centres[1], ratio).T
+    def regrid(values: Float[Array, "nx ny"]) -> Float[np.ndarray, "mx my"]:
+        rows = _regrid_rows(np.asarray(values, dtype=np.float64), centres[0], ratio)
+        return _regrid_rows(rows.T, centres[1], ratio).T
 
     height = regrid(pile.height)
     ground = valid = None
@@ -78,21 +78,27 @@ def _regrid_rows(
     The half cell outside the first and the last centre continues their line.
     """
 
-    def piece(position):
+    def piece(
+        position: Float[np.ndarray, " k"],
+    ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, "k 1"]]:
         left = np.clip(np.floor(position).astype(int), 0, len(values) - 2)
         return left, (position - left)[:, np.newaxis]
 
     if ratio < 1.0:
         left, t = piece(centres)
-        return (1.0 - t) * values[left] + t * values[left + 1]
+        between: np.ndarray = (1.0 - t) * values[left] + t * values[left + 1]
+        return between
     area = np.zeros_like(values)  # integral from the first centre to each other one
     np.cumsum(0.5 * (values[1:] + values[:-1]), axis=0, out=area[1:])
 
-    def integral(position):
+    def integral(position: Float[np.ndarray, " k"]) -> Float[np.ndarray, "k m"]:
         left, t = piece(position)
-        return area[left] + values[left] * t + (values[left + 1] - values[left]) * (0.5 * t * t)
+        rise = values[left + 1] - values[left]
+        total: np.ndarray = area[left] + values[left] * t + rise * (0.5 * t * t)
+        return total
 
-    return (integral(centres + 0.5 * ratio) - integral(centres - 0.5 * ratio)) / ratio
+    mean: np.ndarray = (integral(centres + 0.5 * ratio) - integral(centres - 0.5 * ratio)) / ratio
+    return mean
 
 
 def _any_in_rows(
@@ -104,4 +110,5 @@ def _any_in_rows(
     first = np.clip(np.floor(centres - half + 1e-6).astype(int), 0, len(flags) - 2)
     last = np.clip(np.ceil(centres + half - 1e-6).astype(int), 1, len(flags) - 1)
     count = np.concatenate([np.zeros_like(flags[:1], dtype=int), np.cumsum(flags, axis=0)])
-    return count[last + 1] > count[np.minimum(first, last)]
+    found: np.ndarray = count[last + 1] > count[np.minimum(first, last)]
+    return found

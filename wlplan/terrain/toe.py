@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float
 from scipy import ndimage
 
 from wlplan.checks import check_pile
@@ -68,7 +68,8 @@ def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA
     def along(distance: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Points at distances along the line [m]; a closed one wraps round, an open one ends."""
         inside = distance % length if closed else np.clip(distance, 0.0, length)
-        return np.interp(inside, marks, line)
+        points: np.ndarray = np.interp(inside, marks, line)
+        return points
 
     at = np.linspace(0.0, length, count, endpoint=not closed)
     points = along(at)
@@ -111,21 +112,6 @@ def check_accessible(accessible: Bool[np.ndarray, " n"]) -> None:
         )
 
 
-def evenly_spaced(contour: ToeContour, n: int) -> Int[np.ndarray, " n"]:
-    """Indices of `n` accessible points of a contour, evenly spaced along its accessible part.
-
-    Raises:
-        InputError: If the contour has fewer than `n` accessible points.
-    """
-    candidates = np.flatnonzero(contour.accessible)
-    if not 1 <= n <= candidates.size:
-        raise InputError(
-            f"{n} dig locations asked for, but the toe has {candidates.size} accessible points: "
-            f"ask for 1 to {candidates.size}."
-        )
-    return candidates[((np.arange(n) + 0.5) * candidates.size / n).astype(int)]
-
-
 def edge_poses(contour: ToeContour, locations: int) -> Pose:
     """Poses evenly spaced by arc length over the accessible part of a toe, heading inward.
 
@@ -150,7 +136,8 @@ def edge_poses(contour: ToeContour, locations: int) -> Pose:
     weight = np.where(contour.accessible[neighbour], np.abs(offset), 0.0)
 
     def between(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
-        return (1.0 - weight) * values[nearest] + weight * values[neighbour]
+        mean: np.ndarray = (1.0 - weight) * values[nearest] + weight * values[neighbour]
+        return mean
 
     heading = np.arctan2(between(np.sin(contour.heading)), between(np.cos(contour.heading)))
     # Between two points of an open contour's ends, or of a cusp, the headings may cancel.
@@ -164,7 +151,8 @@ def edge_poses(contour: ToeContour, locations: int) -> Pose:
 
 def _turn(start: Float[np.ndarray, " n"], end: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Angle from one heading to another [rad], -pi to pi."""
-    return (end - start + math.pi) % (2.0 * math.pi) - math.pi
+    turn: np.ndarray = (end - start + math.pi) % (2.0 * math.pi) - math.pi
+    return turn
 
 
 def _inside(
@@ -175,7 +163,8 @@ def _inside(
 ) -> Bool[np.ndarray, " n"]:
     cells = (points - complex(*origin)) / cell
     i, j, last = cells.real, cells.imag, np.array(shape) - 1 + 1e-6
-    return (i >= -1e-6) & (i <= last[0]) & (j >= -1e-6) & (j <= last[1])
+    inside: np.ndarray = (i >= -1e-6) & (i <= last[0]) & (j >= -1e-6) & (j <= last[1])
+    return inside
 
 
 def _sample(
@@ -187,4 +176,5 @@ def _sample(
     """Bilinear values at points of the world; outside the map those of its edge."""
     cells = (points - complex(*origin)) / cell
     at = np.stack([cells.real, cells.imag])
-    return ndimage.map_coordinates(values, at, order=1, mode="nearest")
+    sampled: np.ndarray = ndimage.map_coordinates(values, at, order=1, mode="nearest")
+    return sampled

@@ -181,7 +181,10 @@ def predict_with_deviation(
 ) -> tuple[Performance, Performance | None]:
     """Prediction of each cycle and, by an ensemble, its standard deviation; leaves of shape [n]."""
     views = getattr(dataset, model.view_variable)
-    return _of_views(model, jnp.asarray(views), jnp.asarray(dataset.action))
+    predicted: tuple[Performance, Performance | None] = _of_views(
+        model, jnp.asarray(views), jnp.asarray(dataset.action)
+    )
+    return predicted
 
 
 @jax.jit
@@ -191,4 +194,7 @@ def _of_views(model: Any, views: Array, action: Array) -> tuple[Performance, Per
             return model.of_view_with_deviation(*cycle)
         return model.of_view(*cycle), None
 
-    return jax.lax.map(one, (views, action), batch_size=_CHUNK)
+    predicted: tuple[Performance, Performance | None] = jax.lax.map(
+        one, (views, action), batch_size=_CHUNK
+    )
+    return predicted

@@ -111,4 +111,5 @@ def _scaled_pairs(table: Mapping[str, np.ndarray], mean: Array) -> dict[str, Arr
         }
 
     before = jnp.asarray(table["maps"])
-    return jax.vmap(pair)(before, before + jnp.asarray(table["changes"]))
+    pairs: dict[str, Array] = jax.vmap(pair)(before, before + jnp.asarray(table["changes"]))
+    return pairs

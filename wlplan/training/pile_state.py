@@ -88,7 +88,8 @@ def misplaced_volume(
         dataset: The cycles.
     """
     wrong = np.abs(predicted - dataset.h52_after.astype(np.float64))
-    return wrong.sum(axis=(1, 2)) * CELL_SIZE**2
+    volume: np.ndarray = wrong.sum(axis=(1, 2)) * CELL_SIZE**2
+    return volume
 
 
 def predict_pile_state(model: PileStatePredictor, dataset: Dataset) -> Float[np.ndarray, "n 52 52"]:
@@ -103,9 +104,11 @@ def _predicted(model: Any, before: Array, known: Array) -> Array:
         height, known = cycle
         local = LocalHeightmap(height, CELL_SIZE, STATE_DISPLACEMENT)
         ground = jnp.full_like(height, height.min())
-        return height + model(local, known[:4], known[4], ground)
+        after: Array = height + model(local, known[:4], known[4], ground)
+        return after
 
-    return jax.lax.map(one, (before, known), batch_size=_CHUNK)
+    maps: Array = jax.lax.map(one, (before, known), batch_size=_CHUNK)
+    return maps
 
 
 def state_tables(dataset: Dataset) -> dict[str, np.ndarray]:

@@ -128,7 +128,8 @@ class Settings:
 
 def setting_of(field: dataclasses.Field[Any]) -> Setting:
     """What a field of settings means and may be."""
-    return field.metadata["setting"]
+    setting: Setting = field.metadata["setting"]
+    return setting
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -73,7 +73,8 @@ def train(
             model cannot be saved.
     """
     training: Any = importlib.import_module(f"{__package__}.{settings.kind}")
-    return training.train(settings, dataset, out=out, progress=progress)
+    trained: tuple[Any, Report] = training.train(settings, dataset, out=out, progress=progress)
+    return trained
 
 
 class Trainer:

@@ -114,7 +114,7 @@ def _is_done(place: Path, marks: list[str], settings: Settings) -> bool:
         description = read_description(place, settings.kind)
     except InputError:
         return False
-    return (
+    return bool(
         description["training"].get("settings") == settings.as_dict()
         and description["dataset"].get("fingerprints") == marks
         and description["versions"] == versions()

@@ -16,7 +16,7 @@ more, where there is more to say:
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import jax
 from flax import struct
@@ -24,14 +24,17 @@ from flax import struct
 from wlplan.errors import InputError
 from wlplan.types import Action, Performance, Pile, Pose, World
 
+Uncertainty = Callable[[Pile, Pose, Action], Performance]
+"""`uncertainty(pile, pose, action)`: the standard deviation of the error of the performance."""
+
 
 @no_type_check
 class FunctionWorld(struct.PyTreeNode):
     """A plain function as a world that can be passed to jitted functions, and what it can do."""
 
-    function: Callable[..., Any] = struct.field(pytree_node=False)
+    function: World = struct.field(pytree_node=False)
     differentiable: bool | None = struct.field(pytree_node=False, default=None)  # None: not said
-    deviation: Callable[..., Any] | None = struct.field(pytree_node=False, default=None)
+    deviation: Uncertainty | None = struct.field(pytree_node=False, default=None)
 
     def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         """The pile and the performance after one loading."""
@@ -57,10 +60,10 @@ class FunctionWorld(struct.PyTreeNode):
 
 
 def world(
-    function: Callable[..., Any],
+    function: World,
     *,
     differentiable: bool = True,
-    uncertainty: Callable[..., Any] | None = None,
+    uncertainty: Uncertainty | None = None,
 ) -> FunctionWorld:
     """A function as a world that says what it can do.
 

@@ -61,7 +61,8 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
         self, pile: Pile, pose: Pose, action: Action
     ) -> tuple[Pile, Performance, SolveReport]:
         """The same, and how the solvers ended."""
-        return _solve(self, pile, pose, action)
+        solved: tuple[Pile, Performance, SolveReport] = _solve(self, pile, pose, action)
+        return solved
 
     @property
     def has_uncertainty(self) -> bool:
@@ -82,7 +83,8 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
                 "the model of this world is a single network without uncertainty: train an "
                 "ensemble with `wlplan train --members 5`."
             )
-        return _deviation(self, pile, pose, action)
+        deviation: Performance = _deviation(self, pile, pose, action)
+        return deviation
 
 
 @jax.jit
@@ -109,4 +111,6 @@ def _solve(
 
 @jax.jit
 def _deviation(world: LearnedWorld, pile: Pile, pose: Pose, action: Action) -> Performance:
-    return world.performance.with_deviation(sample_local(pile, pose), action_vector(action))[1]
+    local, vector = sample_local(pile, pose), action_vector(action)
+    deviation: Performance = world.performance.with_deviation(local, vector)[1]
+    return deviation

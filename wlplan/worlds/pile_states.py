@@ -6,7 +6,7 @@ knows local heightmaps alone, is `LocalChange(φ)`.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, no_type_check
+from typing import TYPE_CHECKING, Any, NamedTuple, no_type_check
 
 from flax import struct
 from jaxtyping import Array, Float
@@ -35,6 +35,10 @@ class Dug(NamedTuple):
 @no_type_check
 class Strip(struct.PyTreeNode):
     """The load leaves a strip as wide as the bucket. Paper, section 4.6."""
+
+    if TYPE_CHECKING:
+
+        def __init__(self) -> None: ...
 
     def on_grid(
         self,

@@ -11,26 +11,14 @@ from wlplan.site.machine import WheelLoader
 
 # Section of the bucket from the cutting edge along the floor and up the back wall: forward and up
 # from the cutting edge of a level bucket [m]. Estimate from side views of general-purpose buckets;
-# for `_DEPTH` of floor and, `_WIDTH` wide, 3.10 m^3 heaped.
+# for `_DEPTH` of floor [m] and, 2.70 m wide, 3.10 m^3 heaped.
 _SECTION = np.array(
     [[0.0, 0.0], [-0.98, 0.0], [-1.22, 0.12], [-1.32, 0.38], [-1.30, 0.78], [-0.98, 1.17]]
 )
-_DEPTH, _WIDTH = 1.10, 2.70
+_DEPTH = 1.10
 
 # Distance between the spheres of the plates and their radius [m]: no gap lets a grain through.
 SPACING, PLATE_RADIUS = 0.075, 0.05
-
-
-def heaped_volume(section: np.ndarray, width: float) -> float:
-    """Volume heaped at a slope of 1:2 over the opening [m^3], as buckets are rated (ISO 7546).
-
-    Args:
-        section: Corners from the cutting edge to the upper edge [m], shape [n, 2].
-        width: Width of the bucket [m].
-    """
-    opening = float(np.linalg.norm(section[-1] - section[0]))
-    # A ridge of slope 1:2 along the middle of the opening, a quarter of the opening high.
-    return width * (_area(section) + opening**2 / 8.0)
 
 
 def _area(section: np.ndarray) -> float:
@@ -42,12 +30,14 @@ def section_of(machine: WheelLoader) -> np.ndarray:
     """Section of a machine's bucket, in the frame of its cutting edge [m], shape [6, 2].
 
     The drawing is stretched along the floor to the machine's bucket depth, and in height until the
-    heaped volume is the machine's.
+    heaped volume is the machine's: with a heap of slope 1:2 over the opening, as buckets are rated
+    (ISO 7546).
 
     Raises:
         InputError: If no height gives that volume.
     """
     stretch = machine.bucket_depth / _DEPTH
+    # The heap is a ridge of slope 1:2 along the middle of the opening, a quarter of it high:
     # heaped / width = area * s * h + ((length * s)^2 + (height * h)^2) / 8, solved for h.
     length, height = _SECTION[-1]
     a = height**2 / 8.0
@@ -60,7 +50,8 @@ def section_of(machine: WheelLoader) -> np.ndarray:
             f"not hold {machine.bucket_heaped:g} m³ heaped at any sensible height: check "
             f"bucket_heaped, bucket_depth and bucket_width."
         )
-    return _SECTION * np.array([stretch, rise])
+    section: np.ndarray = _SECTION * np.array([stretch, rise])
+    return section
 
 
 def plate_spheres(machine: WheelLoader) -> np.ndarray:
@@ -110,4 +101,5 @@ def inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
     straddles = (z0 > z) != (z1 > z)
     rise = np.where(z1 == z0, 1.0, z1 - z0)
     crossing = x0 + (z - z0) * (x1 - x0) / rise
-    return ((straddles & (x < crossing)).sum(axis=1) % 2).astype(bool)
+    odd: np.ndarray = (straddles & (x < crossing)).sum(axis=1) % 2
+    return odd.astype(bool)

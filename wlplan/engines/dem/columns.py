@@ -29,7 +29,10 @@ def axes() -> tuple[np.ndarray, np.ndarray]:
 
 def cells_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Positions [m] in units of cells, shape [2, n]."""
-    return np.stack([x + DISPLACEMENT, y]) / CELL_SIZE + np.array([[0.0], [(CELLS - 1) / 2]])
+    cells: np.ndarray = np.stack([x + DISPLACEMENT, y]) / CELL_SIZE + np.array(
+        [[0.0], [(CELLS - 1) / 2]]
+    )
+    return cells
 
 
 def column_height(centre: np.ndarray, radius: np.ndarray, packing: float) -> np.ndarray:
@@ -52,7 +55,8 @@ def column_height(centre: np.ndarray, radius: np.ndarray, packing: float) -> np.
             np.add.at(height, (low[0] + i, low[1] + j), share * volume)
     spread = np.sqrt(_COLUMN_SPREAD**2 - _SHARED**2) / CELL_SIZE
     # Reflecting at the edges keeps the sum.
-    return gaussian_filter(height / CELL_SIZE**2, spread, mode="reflect")
+    smooth: np.ndarray = gaussian_filter(height / CELL_SIZE**2, spread, mode="reflect")
+    return smooth
 
 
 def envelope(centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -77,10 +81,12 @@ def envelope(centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
             hit = (rest > 0.0) & (cell >= 0).all(axis=0) & (cell < count).all(axis=0)
             np.maximum.at(top, tuple(cell[:, hit]), centre[hit, 2] + np.sqrt(rest[hit]))
     smooth = gaussian_filter(top, _ENVELOPE_SPREAD / size, mode="nearest")
-    return smooth.reshape(CELLS, fine, CELLS, fine).mean(axis=(1, 3))
+    mean: np.ndarray = smooth.reshape(CELLS, fine, CELLS, fine).mean(axis=(1, 3))
+    return mean
 
 
 def centre_line(height: np.ndarray) -> np.ndarray:
     """Mean height of the four columns nearest to the centre line [m], shape [cells]."""
     middle = CELLS // 2
-    return height[:, middle - 2 : middle + 2].mean(axis=1)
+    line: np.ndarray = height[:, middle - 2 : middle + 2].mean(axis=1)
+    return line

@@ -18,8 +18,8 @@ from wlplan.engines.dem.packing import Bed, Walls, cut, in_lane
 from wlplan.site.machine import WheelLoader
 from wlplan.site.soil import Soil
 
-# Steps of the engine between two of the machine, at the time step of gravel and the size of grain.
-_STEPS, _CONTROL = 10, 4e-3
+# Time between two steps of the machine [s]: ten of the engine's, at gravel and the usual grain.
+_CONTROL = 4e-3
 # Rest after cutting and after digging: time with drag, drag [N s/m], time without.
 _AFTER_CUT, _AFTER_DIG, _DRAG = (0.15, 0.35), (0.02, 0.60), 60.0
 # What counts as in the bucket, in its own frame: from a little behind its back to a pile over its
@@ -188,9 +188,10 @@ def _in_bucket(
     local = loader.linkage.in_bucket(*place, centre)
     section = section_of(machine)
     lowest = loader.linkage.points(*place, plates)[:, 2].min()
-    within = (local[:, 0] > section[:, 0].min() - _BACK) & (local[:, 0] < _FRONT)
+    within: np.ndarray = (local[:, 0] > section[:, 0].min() - _BACK) & (local[:, 0] < _FRONT)
     within &= (local[:, 2] > _FLOOR) & (centre[:, 2] > lowest + _LIFTED)
-    return within & (np.abs(local[:, 1]) < 0.5 * machine.bucket_width + _SIDE)
+    within &= np.abs(local[:, 1]) < 0.5 * machine.bucket_width + _SIDE
+    return within
 
 
 class _Rest:
@@ -251,4 +252,5 @@ def change_of(cycle: CycleRecord, density: float) -> np.ndarray:
     gain, loss = np.maximum(change, 0.0), np.maximum(-change, 0.0)
     volume = cycle.mass / density / CELL_SIZE**2
     wanted = volume + gain.sum()
-    return gain - loss * (wanted / loss.sum() if loss.sum() > 0.0 else 0.0)
+    balanced: np.ndarray = gain - loss * (wanted / loss.sum() if loss.sum() > 0.0 else 0.0)
+    return balanced

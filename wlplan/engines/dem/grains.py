@@ -66,5 +66,5 @@ class DemSettings:
         4e-4 s suits spheres of 0.095 m at the density of gravel; a contact lasts for a time that
         grows with the root of the mass.
         """
-        size = (self.grains.radius / 0.095) ** 1.5
+        size: float = (self.grains.radius / 0.095) ** 1.5
         return 4e-4 * size * math.sqrt(min(density / GRAVEL.density, 1.0))

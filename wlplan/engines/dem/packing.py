@@ -99,4 +99,7 @@ def _spread(bed: Bed, walls: Walls, packing: int) -> tuple[np.ndarray, np.ndarra
 
 def in_lane(centre: np.ndarray, width: float) -> np.ndarray:
     """Which spheres lie where the bucket of a given width [m] starts."""
-    return (centre[:, 0] < _LANE_END) & (np.abs(centre[:, 1]) < 0.5 * width + _LANE_MARGIN)
+    within: np.ndarray = (centre[:, 0] < _LANE_END) & (
+        np.abs(centre[:, 1]) < 0.5 * width + _LANE_MARGIN
+    )
+    return within

@@ -20,8 +20,6 @@ from wlplan.errors import InputError
 from wlplan.site.machine import WheelLoader
 from wlplan.site.soil import Soil
 
-JOBS = ("bed", "cycle")
-"""Kinds of jobs."""
 VERSION = 1
 """Grows with every change that makes other results of the same job."""
 
@@ -46,8 +44,8 @@ def run(job: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, np.ndar
     """Does a job.
 
     Args:
-        job: Its "kind", of `JOBS`, its "settings", and for a cycle "machine", "soil", "walls" and
-            the path of the "bed": fields of the classes of these names.
+        job: Its "kind", "bed" or "cycle", its "settings", and for a cycle "machine", "soil",
+            "walls" and the path of the "bed": fields of the classes of these names.
         arrays: For a cycle "surface" [m] and "action".
 
     Returns:

@@ -64,7 +64,8 @@ class DiscreteElements(struct.PyTreeNode):
 
         The engine's floor is level: where the pile's is not, the soil is laid down on a level one.
         """
-        return _view(pile, pose)
+        height: Array = _view(pile, pose)
+        return height
 
     def play(
         self, surface: np.ndarray, action: np.ndarray, tell: Callable[[str], None]

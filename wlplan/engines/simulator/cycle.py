@@ -314,7 +314,7 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
             return old
         return old + fraction.reshape(*(1,) * (old.ndim - 1), -1) * (new - old)
 
-    mixed = jax.tree.map(mix, state, trial)
+    mixed: State = jax.tree.map(mix, state, trial)
     # The bucket may be at its tilt end before the brake lets go.
     mixed = mixed.replace(tilt=jnp.minimum(mixed.tilt, machine.tilt_end))
     stop_x, stop_z = loader.bucket_tip(machine, mixed.position, mixed.boom, mixed.tilt)
@@ -360,7 +360,8 @@ def dig(
         cycles = _dig_recorded(one[0], one[1], one[2], machine, soil, settings)
     else:
         cycles = _digger(machine, soil, settings)(one[0], one[1], one[2])
-    return jax.tree.map(lambda part: part[..., 0], cycles)
+    cycle: Cycle = jax.tree.map(lambda part: part[..., 0], cycles)
+    return cycle
 
 
 def _dig_recorded(

@@ -34,30 +34,6 @@ _FAILURE_ANGLES = tuple(math.radians(4.0) + k * _ANGLE_STEP for k in range(10))
 _LOCKED = 0.05
 
 
-def earthmoving_force(
-    depth: Float[Array, "*n"],
-    rake: Float[Array, "*n"],
-    slope: Float[Array, "*n"],
-    *,
-    soil: Soil,
-    external_friction: Float[Array, "*n"] | float | None = None,
-    surcharge: Float[Array, "*n"] | float = 0.0,
-) -> Float[Array, "*n"]:
-    """Force on a blade a metre of width [N/m], at the external friction angle from its normal.
-
-    Args:
-        depth: Depth of the cutting edge normal to the surface [m], not negative.
-        rake: Angle between blade and surface [rad], 0 < rake < pi.
-        slope: Slope of the surface along the direction of motion, rising positive [rad].
-        soil: Soil parameters.
-        external_friction: Friction between blade and soil [rad]; default: soil on steel.
-        surcharge: Load on the surface [Pa].
-    """
-    friction = soil.steel_friction if external_friction is None else external_friction
-    wedge = wedge_of(depth, rake, slope, friction, soil=soil, surcharge=surcharge)
-    return least_resistance(wedge, soil=soil)
-
-
 class Wedge(NamedTuple):
     """What the resistance of a wedge depends on, but for its failure angle."""
 
@@ -79,7 +55,16 @@ def wedge_of(
     soil: Soil,
     surcharge: Float[Array, "*n"] | float = 0.0,
 ) -> Wedge:
-    """The wedge that a blade pushes up; arguments as for `earthmoving_force`."""
+    """The wedge that a blade pushes up.
+
+    Args:
+        depth: Depth of the cutting edge normal to the surface [m], not negative.
+        rake: Angle between blade and surface [rad], 0 < rake < pi.
+        slope: Slope of the surface along the direction of motion, rising positive [rad].
+        external_friction: Friction between blade and soil [rad].
+        soil: Soil parameters.
+        surcharge: Load on the surface [Pa].
+    """
     sin_rake, beyond = jnp.sin(rake), rake + soil.friction
     return Wedge(
         load=soil.density * GRAVITY * depth**2 / 2 + surcharge * depth,
@@ -92,7 +77,10 @@ def wedge_of(
 
 
 def least_resistance(wedge: Wedge, *, soil: Soil) -> Float[Array, "*n"]:
-    """Force on the blade that pushes up a wedge, a metre of width [N/m]."""
+    """Force on the blade that pushes up a wedge, a metre of width [N/m].
+
+    It acts at the external friction angle from the normal of the blade.
+    """
 
     def resistance(wedge: Wedge, sin_beta: Array, cos_beta: Array) -> Array:
         sin_eta = wedge.locking[0] * cos_beta + wedge.locking[1] * sin_beta

@@ -71,7 +71,8 @@ class Reaction(NamedTuple):
 def lane_widths(machine: WheelLoader) -> np.ndarray:
     """Width of bucket in each column of the heightfield [m]; the outermost lanes are partial."""
     edge = np.clip((machine.bucket_width / 2 - np.abs(_LEFT)) / CELL_SIZE + 0.5, 0.0, 1.0)
-    return edge * CELL_SIZE
+    width: np.ndarray = edge * CELL_SIZE
+    return width
 
 
 class Lanes:
@@ -147,7 +148,8 @@ def fullness(
 
 def _least(width: np.ndarray) -> np.ndarray:
     """The floor keeps lanes that the bucket hardly covers finite."""
-    return np.maximum(width, 0.1 * CELL_SIZE)
+    least: np.ndarray = np.maximum(width, 0.1 * CELL_SIZE)
+    return least
 
 
 def reaction(

@@ -69,7 +69,8 @@ def trace(
         return lax.scan(step, state, None, length=settings.max_steps + 1)[1]
 
     one = jax.tree.map(lambda part: jnp.asarray(part)[..., None], (height, ground, action))
-    return jax.tree.map(lambda part: part[..., 0], side_by_side(play)(*one))
+    path: Trajectory = jax.tree.map(lambda part: part[..., 0], side_by_side(play)(*one))
+    return path
 
 
 def _moment(state: State, machine: WheelLoader, soil: Soil) -> Trajectory:

@@ -56,7 +56,8 @@ class Simulator(struct.PyTreeNode):
         self, pile: Pile, pose: Pose, action: Action
     ) -> tuple[Pile, Performance, SolveReport]:
         """One loading as by calling it, and how the automaton ended."""
-        return _solve(self, pile, pose, action)
+        solved: tuple[Pile, Performance, SolveReport] = _solve(self, pile, pose, action)
+        return solved
 
     def play(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance, Cycle]:
         """One loading with its record.

@@ -92,7 +92,7 @@ def find_reader(path: Path) -> Reader:
         )
     ((place, point),) = places.items()
     try:
-        reader = point.load()
+        reader: Reader = point.load()
         _check(reader)
     except Exception as error:
         # It is the code of others: importing it may raise anything.

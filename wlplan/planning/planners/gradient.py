@@ -115,7 +115,8 @@ class Gradient:
         steps = Decisions(*sizes)
 
         def scale(updates: Decisions, _: Decisions | None) -> Decisions:
-            return jax.tree.map(lambda size, update: size * update, steps, updates)
+            scaled: Decisions = jax.tree.map(lambda size, update: size * update, steps, updates)
+            return scaled
 
         return optax.chain(
             optax.scale_by_adam(b1=0.8),
@@ -149,4 +150,5 @@ def _advance(
 
 
 def _row(plans: Decisions, row: int) -> Decisions:
-    return jax.tree.map(lambda leaf: leaf[row : row + 1], plans)
+    one: Decisions = jax.tree.map(lambda leaf: leaf[row : row + 1], plans)
+    return one

@@ -60,12 +60,13 @@ def _first_crossing(
 ) -> tuple[int, int] | None:
     """Two of the segments from starts to ends that cross; None if there are none."""
 
-    def side(a, b, c):
+    def side(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
         """Sign of the turn from a to b to c, for each pair of segments."""
-        return np.sign(
+        sign: np.ndarray = np.sign(
             (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1])
             - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
         )
+        return sign
 
     p, q = starts[:, np.newaxis], ends[:, np.newaxis]
     r, t = starts[np.newaxis], ends[np.newaxis]
@@ -80,7 +81,8 @@ def _on_pile(points: Float[np.ndarray, "n 2"], pile: Pile) -> Bool[np.ndarray, "
     shape = np.array(pile.height.shape)
     inside = np.all((cells >= 0) & (cells < shape), axis=-1)
     i, j = np.clip(cells, 0, shape - 1).T
-    return inside & (height_above_ground(pile)[i, j] > RISE)
+    on_pile: np.ndarray = inside & (height_above_ground(pile)[i, j] > RISE)
+    return on_pile
 
 
 def _distance(
@@ -88,7 +90,8 @@ def _distance(
 ) -> Float[np.ndarray, " n"]:
     """Distance to the nearest of the others [m]; infinite if there are none."""
     apart = points[:, np.newaxis] - others[np.newaxis]
-    return np.min(np.hypot(apart[..., 0], apart[..., 1]), axis=1, initial=np.inf)
+    nearest: np.ndarray = np.min(np.hypot(apart[..., 0], apart[..., 1]), axis=1, initial=np.inf)
+    return nearest
 
 
 def draw_digs(

@@ -29,7 +29,8 @@ _MARGIN = 2.0
 
 def height_above_ground(pile: Pile) -> Float[np.ndarray, "nx ny"]:
     """Height of the surface above the ground [m]."""
-    return np.asarray(pile.height, float) - np.asarray(pile.floor, float)
+    height: np.ndarray = np.asarray(pile.height, float) - np.asarray(pile.floor, float)
+    return height
 
 
 def _extent(pile: Pile) -> tuple[float, float, float, float]:
@@ -65,7 +66,8 @@ def _relief(height: Float[np.ndarray, "nx ny"], cell_size: float) -> Float[np.nd
     facing = (math.sin(elevation) - east * light[0] - north * light[1]) / np.sqrt(
         1.0 + east**2 + north**2
     )
-    return np.clip(1.0 + 0.6 * (facing - math.sin(elevation)), 0.4, 1.13)
+    brightness: np.ndarray = np.clip(1.0 + 0.6 * (facing - math.sin(elevation)), 0.4, 1.13)
+    return brightness
 
 
 def draw_pile(

@@ -53,7 +53,10 @@ class Truck:
         left = np.array([-self.ahead[1], self.ahead[0]])
         centre = self.way[1] + (0.5 * width + 0.3) * self.ahead + shift * length * left
         along, across = 0.5 * long * length * left, 0.5 * wide * width * self.ahead
-        return centre + np.stack([along + across, along - across, -along - across, across - along])
+        corners: np.ndarray = centre + np.stack(
+            [along + across, along - across, -along - across, across - along]
+        )
+        return corners
 
     def is_near(self, view: Float[np.ndarray, "2 2"]) -> bool:
         """Whether it stands near enough to a view to widen it."""

@@ -18,6 +18,8 @@ from jaxtyping import Array, Float
 from wlplan.terrain.automaton import FLOW_FRACTION
 
 Surface = Float[np.ndarray, "nx ny"]
+# A number in the precision of a surface.
+_Real = np.floating[Any]
 
 Sweeps = Callable[[Surface, float, int], Surface]
 """`sweeps(height, drop, count)`: the surface after some sweeps, see `automaton.sweeps`."""
@@ -92,7 +94,9 @@ def _numba_kernel() -> Callable[..., None]:
     # The tests wrap every function to check its shapes, which Numba cannot see through.
     sweep = numba.njit(inspect.unwrap(_sweep_cells))
 
-    def many(cells, other, side, diagonal, part, count):
+    def many(
+        cells: Surface, other: Surface, side: _Real, diagonal: _Real, part: _Real, count: int
+    ) -> None:
         for _ in range(count // 2):
             sweep(cells, other, side, diagonal, part)
             sweep(other, cells, side, diagonal, part)
@@ -100,10 +104,11 @@ def _numba_kernel() -> Callable[..., None]:
             sweep(cells, other, side, diagonal, part)
             cells[:] = other
 
-    return numba.njit(inspect.unwrap(many))
+    kernel: Callable[..., None] = numba.njit(inspect.unwrap(many))
+    return kernel
 
 
-def _sweep_cells(cells, after, side, diagonal, part):
+def _sweep_cells(cells: Surface, after: Surface, side: _Real, diagonal: _Real, part: _Real) -> None:
     """One sweep from an array with a mirrored rim into another; side and diagonal are limits [m].
 
     Every edge is looked at from both ends: the compiler turns a loop that only reads its

@@ -137,7 +137,8 @@ class Setup:
     @functools.cached_property
     def plan(self) -> LoadingPlan:
         """One of them, leaves [40]."""
-        return jax.tree.map(lambda leaf: leaf[0], self.plans(1))
+        plan: LoadingPlan = jax.tree.map(lambda leaf: leaf[0], self.plans(1))
+        return plan
 
 
 def floats(values: Any) -> Array:

@@ -24,20 +24,17 @@ count as constants.
 """
 
 from wlplan.terrain.automaton.flow import FLOW_FRACTION, converged, sweep, sweeps
-from wlplan.terrain.automaton.relaxation import Settled, relax, settle, settle_dug
+from wlplan.terrain.automaton.relaxation import relax, settle, settle_dug
 from wlplan.terrain.automaton.rounds import DEFAULT_SCHEDULE, Schedule
 from wlplan.terrain.automaton.slopes import movable, steepest_slope
-from wlplan.terrain.automaton.windows import WINDOW, pad_pile, window_of
+from wlplan.terrain.automaton.windows import window_of
 
 __all__ = [
     "DEFAULT_SCHEDULE",
     "FLOW_FRACTION",
-    "WINDOW",
     "Schedule",
-    "Settled",
     "converged",
     "movable",
-    "pad_pile",
     "relax",
     "settle",
     "settle_dug",

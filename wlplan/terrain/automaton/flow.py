@@ -144,21 +144,33 @@ def _sweep_on(
     return (rim(neighbour(rimmed, 0, 0) + velocity), velocity), part
 
 
-def _slide_forward(height: Array, links: Array | None, drop: float, momentum: float, count: int):
-    def step(state: tuple[Array, Array], _: None):
+# For the reverse rule of `slide`: surface and part of the velocity of each sweep, and the links.
+_Record = tuple[Array, Array, Array | None]
+
+
+def _slide_forward(
+    height: Array, links: Array | None, drop: float, momentum: float, count: int
+) -> tuple[Array, _Record]:
+    def step(
+        state: tuple[Array, Array], _: None
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         after, part = _sweep_on(state, links, drop, momentum)
         return after, (state[0], part)
 
-    (rimmed, _), record = lax.scan(step, _at_standstill(height), None, length=count)
-    return neighbour(rimmed, 0, 0), (*record, links)
+    (rimmed, _), (surfaces, parts) = lax.scan(step, _at_standstill(height), None, length=count)
+    return neighbour(rimmed, 0, 0), (surfaces, parts, links)
 
 
-def _slide_backward(drop: float, momentum: float, count: int, record, cotangent: Array):
+def _slide_backward(
+    drop: float, momentum: float, count: int, record: _Record, cotangent: Array
+) -> tuple[Array, None]:
     surfaces, parts, links = record
 
     # `both` is the cotangent of a sweep's velocity: that of the next velocity and of the surface.
     # Carried with its rim, as the flow is: XLA makes far slower code of the other ways tried.
-    def step(state: tuple[Array, Array], recorded: tuple[Array, Array]):
+    def step(
+        state: tuple[Array, Array], recorded: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array], None]:
         height, both = state
         surface, part = recorded
         height = height - FLOW_FRACTION * rim(_spread(both, surface, drop, links))

@@ -121,7 +121,7 @@ def relax(
             the report says so.
     """
     check_pile(pile)
-    settled = _relaxed(pile, repose_angle, tolerance)
+    settled: Settled = _relaxed(pile, repose_angle, tolerance)
     if report:
         return settled
     if not is_traced(settled) and not settled.at_rest.all():
@@ -256,10 +256,12 @@ def _solver(
     ) -> tuple[Array, Array, Array]:
         return run(before, dug, ground, valid, start)
 
-    def forward(*arguments: Any):
+    def forward(*arguments: Any) -> tuple[tuple[Array, Array, Array], tuple[Any, ...]]:
         return run(*arguments), arguments
 
-    def backward(arguments: tuple[Any, ...], cotangents: tuple[Array, Any, Any]):
+    def backward(
+        arguments: tuple[Any, ...], cotangents: tuple[Array, Any, Any]
+    ) -> tuple[Array, Array, None, None, None]:
         # Rounds, and whether it is at rest, have no derivative.
         return *pull(*(*arguments, cotangents[0])), None, None, None
 

@@ -1,4 +1,4 @@
-"""Cycles of a data set played again, from the local maps that it holds."""
+"""Cycles of a data set simulated again, from the local maps that it holds."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from wlplan.types import Action, action_from
 _BATCH = 64
 
 
-def surfaces(data: Dataset) -> Float[np.ndarray, "n 52 52"]:
+def initial_surfaces(data: Dataset) -> Float[np.ndarray, "n 52 52"]:
     """Surfaces over the floor in the local frames of the dig poses [m].
 
-    The maps are stored over the surface 1 m before the dig location. The floor of the piles is
-    level, and the lowest point of a map is taken to lie on it.
+    The maps of a data set are over the surface 1 m before the dig location. The floor of the piles
+    is level, and the lowest point of a map is taken to lie on it.
     """
-    return data.h52 - data.h52.min(axis=(1, 2), keepdims=True)
+    surfaces: np.ndarray = data.h52 - data.h52.min(axis=(1, 2), keepdims=True)
+    return surfaces
 
 
-def in_batches(
+def resimulate(
     function: Callable[[jax.Array, jax.Array, Action], Any],
     surface: Float[np.ndarray, "n 52 52"],
     action: Float[np.ndarray, "n 4"],
@@ -41,14 +42,14 @@ def in_batches(
 
     @jax.jit
     @jax.vmap
-    def play(height: jax.Array, vector: jax.Array) -> Any:
+    def batch(height: jax.Array, vector: jax.Array) -> Any:
         return function(height, jnp.zeros_like(height), action_from(vector))
 
     parts = []
     for first in range(0, len(surface), _BATCH):
         # The last batch is filled up, so that nothing is compiled twice.
         which = np.minimum(np.arange(first, first + _BATCH), len(surface) - 1)
-        part = play(
+        part = batch(
             jnp.asarray(surface[which], jnp.float32), jnp.asarray(action[which], jnp.float32)
         )
         count = min(_BATCH, len(surface) - first)

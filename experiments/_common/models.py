@@ -1,4 +1,4 @@
-"""Models that experiments need, kept in a folder: what was trained once is not trained again."""
+"""Models that experiments need, saved in a folder: each is trained once, then loaded."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from wlplan.worlds.library import pretrained_path
 
 # Passes over the data with which the paper's ψ_high is trained: 9 s of processor time each.
 CONVOLUTIONAL_EPOCHS = 60
-PSI: dict[str, PerformanceSettings] = {
+PREDICTORS: dict[str, PerformanceSettings] = {
     "psi_low, swish": PsiLowSettings(),
     "psi_low, leaky relu": PsiLowSettings(activation="leaky_relu"),
     "psi_low of the paper, swish": PsiLowSettings(loss="squared"),
@@ -47,28 +47,28 @@ PSI: dict[str, PerformanceSettings] = {
     },
 }
 """The performance predictors that are compared: settings, by title."""
-SHIPPED = {f"{kind}, as it ships": kind for kind in ("psi_low", "psi_high")}
+PRETRAINED = {f"{kind}, as it ships": kind for kind in ("psi_low", "psi_high")}
 """The performance predictors that ship, trained on more cycles than a data set has: kind, by title.
 
 The held-out cycles of the data set are new to them too.
 """
 
 
-def shortened(settings: Settings) -> Settings:
+def smoke_settings(settings: Settings) -> Settings:
     """The settings with which a smoke preset trains in seconds."""
     return dataclasses.replace(settings, epochs=2, hidden=(32,))
 
 
-def shipped(kind: str) -> tuple[Ensemble, dict[str, Any]]:
-    """An ensemble that ships, and its description."""
+def load_pretrained(kind: str) -> tuple[Ensemble, dict[str, Any]]:
+    """The ensemble of a kind that ships with the package, and its description."""
     place = pretrained_path(kind)
     model = load_model(place, kind)
     assert isinstance(model, Ensemble)
     return model, read_description(place, kind)
 
 
-def trained(models: Path, data: Dataset, settings: Settings) -> tuple[Any, float | None]:
-    """A model of these settings on this data set, from the folder, or trained into it.
+def load_or_train(models: Path, data: Dataset, settings: Settings) -> tuple[Any, float | None]:
+    """A model of these settings on this data set, loaded from a folder, or trained into it.
 
     Cut short, the same call goes on where it was.
 

@@ -21,12 +21,12 @@ from wlplan.errors import InputError
 from wlplan.io import write_text_atomic
 from wlplan.xla import cores
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parents[1] / "results"
 PRESETS = ("full", "smoke")
 # The data set of the experiments that need one: where it lies, and its cycles. Paper, section 6.2.
 DATA = Path("out") / "cycles.zarr"
 CYCLES, SMOKE_CYCLES = 10_800, 180
-# The models that experiments train, see `experiments.trained`.
+# The models that experiments train, see `experiments._common.models`.
 MODELS = Path("out") / "models"
 
 
@@ -41,7 +41,7 @@ def conditions() -> dict[str, Any]:
     }
 
 
-def write(name: str, preset: str, result: dict[str, Any], folder: Path) -> Path:
+def write_result(name: str, preset: str, result: dict[str, Any], folder: Path) -> Path:
     """Writes a result with its conditions as JSON."""
     document = {
         "experiment": name,
@@ -61,7 +61,7 @@ def write(name: str, preset: str, result: dict[str, Any], folder: Path) -> Path:
     return path
 
 
-def cycles_at(path: Path, preset: str) -> Dataset:
+def open_or_collect(path: Path, preset: str) -> Dataset:
     """The data set at a path; if it is missing or not finished, it is collected first.
 
     Raises:
@@ -75,7 +75,7 @@ def cycles_at(path: Path, preset: str) -> Dataset:
     return open_dataset(path)
 
 
-def described(data: Dataset) -> dict[str, Any]:
+def dataset_summary(data: Dataset) -> dict[str, Any]:
     """Which data set a result is of."""
     return {
         "cycles": len(data),
@@ -122,9 +122,9 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
         if needs_data:
             path = options.data or (options.out / DATA.name if smoke else DATA)
             try:
-                more["data"] = cycles_at(path, options.preset)
+                more["data"] = open_or_collect(path, options.preset)
             except InputError as error:
                 print(f"error: {error}", file=sys.stderr)
                 raise SystemExit(2) from error
-        write(name, options.preset, run(options.preset, **more), options.out)
+        write_result(name, options.preset, run(options.preset, **more), options.out)
     draw(options.out)
