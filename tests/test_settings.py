@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from typing import Any
 
 import click
 import pytest
@@ -15,7 +16,7 @@ from wlplan.training.settings import Setting, setting_of
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_setting_has_a_meaning_and_a_default_that_it_allows(kind):
+def test_every_setting_has_a_meaning_and_a_default_that_it_allows(kind: str) -> None:
     settings = KINDS[kind]()
     assert settings.kind == kind
     for field in dataclasses.fields(settings):
@@ -42,7 +43,9 @@ def test_every_setting_has_a_meaning_and_a_default_that_it_allows(kind):
         ({"encoder": "magic"}, "convolutional, principal"),
     ],
 )
-def test_what_a_setting_may_not_be_is_refused_in_one_line(change, word):
+def test_what_a_setting_may_not_be_is_refused_in_one_line(
+    change: dict[str, Any], word: str
+) -> None:
     with pytest.raises(InputError, match=word) as error:
         PsiHighSettings(**change)
     assert next(iter(change)) in str(error.value)
@@ -50,13 +53,13 @@ def test_what_a_setting_may_not_be_is_refused_in_one_line(change, word):
 
 
 @pytest.mark.parametrize(("value", "default"), [(1.5, 1), ("1", 1), (True, 1), (True, 1.0)])
-def test_a_setting_of_another_type_is_refused(value, default):
+def test_a_setting_of_another_type_is_refused(value: object, default: object) -> None:
     assert "has to be a" in Setting("Number.").complaint(value, default)
 
 
-def test_every_setting_is_an_option_with_the_defaults_of_the_kinds():
+def test_every_setting_is_an_option_with_the_defaults_of_the_kinds() -> None:
     @click.command()
-    def command(**_):
+    def command(**_: object) -> None:
         """A command."""
 
     for option in training_options():
@@ -70,12 +73,12 @@ def test_every_setting_is_an_option_with_the_defaults_of_the_kinds():
     assert options["hidden"].help.endswith("phi 512,512; phi-vae 1024,1024.")
 
 
-def test_settings_of_two_kinds_are_never_the_same():
+def test_settings_of_two_kinds_are_never_the_same() -> None:
     assert PsiLowSettings(dropout=0.1) != PsiHighSettings()
     assert PhiVaeSettings() == PhiVaeSettings(seed=0)
 
 
-def test_the_help_of_train_needs_no_jax():
+def test_the_help_of_train_needs_no_jax() -> None:
     code = (
         "import sys; from wlplan import cli; cli.main(['train', '--help']); "
         "sys.exit(str(sorted({'jax', 'flax', 'optax'} & set(sys.modules))))"

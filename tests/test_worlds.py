@@ -15,24 +15,26 @@ from wlplan.planning.plan import play
 from wlplan.terrain.automaton import Schedule, relax
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
-from wlplan.types import Action, LoadingPlan, Performance
+from wlplan.types import Action, LoadingPlan, LocalHeightmap, Performance, Pile, Pose
 from wlplan.worlds.capabilities import as_pytree, is_differentiable, with_derivatives
 from wlplan.worlds.library import load_world, pretrained_path
 from wlplan.worlds.names import ENGINES, FOR_PLANNING, WORLDS
 from wlplan.worlds.pile_states import LocalChange, Strip
 
+Scene = tuple[Pile, Pose, Action]
+
 DENSITY = 1.727  # of gravel [tonne/m^3]
 
 
 @pytest.fixture(scope="module")
-def scene():
+def scene() -> Scene:
     """A relaxed cone, and a pose and an action of one loading on it."""
     pile = jax.jit(relax)(seed_pile("conical", slope=np.radians(30.0), height=2.0))
     pose = jax.tree.map(lambda leaf: jnp.float32(leaf[0]), edge_poses(toe_contour(pile), 1))
     return pile, pose, Action(*(jnp.float32(v) for v in (0.4, 2.0, 0.3, 3.0)))
 
 
-def removed(before, after):
+def removed(before: Pile, after: Pile) -> float:
     heights = (np.asarray(pile.height, np.float64).sum() for pile in (before, after))
     return -np.subtract(*reversed(list(heights))) * before.cell_size**2 * DENSITY
 
@@ -40,7 +42,9 @@ def removed(before, after):
 @pytest.mark.parametrize(
     ("psi", "phi"), list(itertools.product(["psi_low", "psi_high"], [None, "phi"])), ids=str
 )
-def test_every_predictor_goes_with_every_pile_state(scene, psi, phi):
+def test_every_predictor_goes_with_every_pile_state(
+    scene: Scene, psi: str, phi: str | None
+) -> None:
     pile, pose, action = scene
     model = load_model(pretrained_path(psi), psi)
     state = Strip() if phi is None else load_model(pretrained_path(phi), phi)
@@ -54,11 +58,13 @@ def test_every_predictor_goes_with_every_pile_state(scene, psi, phi):
     np.testing.assert_array_equal(named(pile, pose, action)[0].height, after.height)
 
 
-def test_a_function_is_a_pile_state(scene):
+def test_a_function_is_a_pile_state(scene: Scene) -> None:
     """φ of one's own: lowers the whole map alike, and says that it keeps the volume."""
     pile, pose, action = scene
 
-    def lowered(local, action, volume, ground):
+    def lowered(
+        local: LocalHeightmap, action: jax.Array, volume: jax.Array, ground: jax.Array
+    ) -> jax.Array:
         above = jnp.maximum(local.height - ground, 0.0)
         return -above * volume / (0.01 * above.sum())
 
@@ -70,7 +76,7 @@ def test_a_function_is_a_pile_state(scene):
     assert removed(pile, after) == pytest.approx(float(performance.mass), rel=0.02)
 
 
-def test_a_pile_state_where_a_predictor_belongs_is_refused():
+def test_a_pile_state_where_a_predictor_belongs_is_refused() -> None:
     with pytest.raises(InputError, match=r"is a phi: name a model that `wlplan train psi-low`"):
         load_world("low", model=pretrained_path("phi"))
     with pytest.raises(InputError, match=r"is a psi_low: name a model that `wlplan train phi`"):
@@ -81,18 +87,18 @@ def test_a_pile_state_where_a_predictor_belongs_is_refused():
         load_world("moon")
 
 
-def test_the_names_are_those_that_load():
+def test_the_names_are_those_that_load() -> None:
     assert set(FOR_PLANNING) | set(ENGINES) == set(WORLDS)
     for name in WORLDS:
         assert callable(load_world(name))
 
 
-def test_worlds_say_whether_they_have_a_derivative():
+def test_worlds_say_whether_they_have_a_derivative() -> None:
     said = {name: is_differentiable(load_world(name)) for name in WORLDS}
     assert said == {"low": True, "hybrid": True, "high": True, "simulator": False, "dem": False}
     assert is_differentiable(with_derivatives(load_world("simulator"))) is True
 
-    def mine(pile, pose, action):
+    def mine(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         return pile, Performance(pose.x, pose.y, pose.heading)
 
     assert is_differentiable(mine) is None
@@ -101,11 +107,11 @@ def test_worlds_say_whether_they_have_a_derivative():
     assert is_differentiable(wlplan.world(mine, differentiable=False)) is False
 
 
-def test_worlds_say_whether_they_have_an_uncertainty(scene):
-    def mine(pile, pose, action):
+def test_worlds_say_whether_they_have_an_uncertainty(scene: Scene) -> None:
+    def mine(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         return pile, Performance(pose.x, pose.y, pose.heading)
 
-    def deviation(pile, pose, action):
+    def deviation(pile: Pile, pose: Pose, action: Action) -> Performance:
         return Performance(0.1 * pose.x, pose.y, pose.heading)
 
     assert load_world("low").has_uncertainty
@@ -121,7 +127,7 @@ def test_worlds_say_whether_they_have_an_uncertainty(scene):
 
 
 @pytest.mark.parametrize("name", ["low", "high", "simulator"])
-def test_a_solve_is_a_call_that_says_how_it_ended(scene, name):
+def test_a_solve_is_a_call_that_says_how_it_ended(scene: Scene, name: str) -> None:
     world = load_world(name)
     after, performance, report = world.solve(*scene)
     same, also = world(*scene)
@@ -133,7 +139,7 @@ def test_a_solve_is_a_call_that_says_how_it_ended(scene, name):
     assert abs(float(report.missing)) < 1e-4
 
 
-def test_a_played_plan_says_how_its_solves_ended(scene):
+def test_a_played_plan_says_how_its_solves_ended(scene: Scene) -> None:
     pile, pose, action = scene
     plan = LoadingPlan(*jax.tree.map(lambda leaf: leaf[None], (pose, action)))
     patient = play(load_world("low"), pile, plan).solves
@@ -145,6 +151,6 @@ def test_a_played_plan_says_how_its_solves_ended(scene):
     assert np.degrees(ended.steepest_slope[0]) > 33.5
 
 
-def test_a_world_can_be_jitted_as_it_is(scene):
+def test_a_world_can_be_jitted_as_it_is(scene: Scene) -> None:
     world = load_world("low")
     np.testing.assert_allclose(jax.jit(world)(*scene)[0].height, world(*scene)[0].height, atol=1e-6)
