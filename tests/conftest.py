@@ -9,4 +9,4 @@ import jax
 import jaxtyping
 
 jaxtyping.install_import_hook("wlplan", "beartype.beartype")
-jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_rank_promotion", "raise")  # type: ignore[no-untyped-call]

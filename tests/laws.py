@@ -11,10 +11,8 @@ from jax.typing import ArrayLike
 
 def assert_volume_kept(before: ArrayLike, after: ArrayLike, *, relative: float = 1e-6) -> None:
     """The summed height is the same to `relative` of the total."""
-    before, after = np.asarray(before, np.float64).sum(), np.asarray(after, np.float64).sum()
-    assert abs(after - before) <= relative * abs(before), (
-        f"the volume changed from {before:.9g} to {after:.9g}"
-    )
+    was, now = (float(np.asarray(height, np.float64).sum()) for height in (before, after))
+    assert abs(now - was) <= relative * abs(was), f"the volume changed from {was:.9g} to {now:.9g}"
 
 
 def assert_gradient(

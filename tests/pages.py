@@ -6,9 +6,13 @@ from html.parser import HTMLParser
 class Page(HTMLParser):
     """A page whose tags are closed in order: its tags, its words, and what it would load."""
 
+    tags: list[str]
+    links: list[str | None]
+    text: str
+
     def __init__(self, source: str) -> None:
         super().__init__()
-        self._open = []
+        self._open: list[str] = []
         self.tags, self.links, self.text = [], [], ""
         self.feed(source)
         self.close()

@@ -99,7 +99,8 @@ def main(path: Path) -> None:
     fields["path"] = fields["path"][:, :longest]
     target = Path(__file__).parent / "references" / f"{name}.npz"
     target.parent.mkdir(exist_ok=True)
-    np.savez_compressed(target, path_names=np.array(list(PATH)), **fields)
+    named: dict[str, Any] = {"path_names": np.array(list(PATH)), **fields}
+    np.savez_compressed(target, **named)
     print(f"{target}: {len(fields['mass_t'])} cycles, {target.stat().st_size / 1024:.0f} KiB")
 
 

@@ -96,6 +96,7 @@ def test_a_baseline_comes_to_rest_where_the_reference_does(automaton: Sweeps) ->
         found = rest(automaton, before, **NUMBERS)
         reference = converged(Pile(jnp.asarray(before), 0.1), tolerance=NUMBERS["tolerance"])
         np.testing.assert_allclose(found.height, reference.height, rtol=0.0, atol=1e-12)
+        assert found.sweeps is not None
         assert found.sweeps > 100
         assert math.degrees(steepest_slope(reference)) <= 33.0
 
@@ -117,9 +118,10 @@ def test_aeolis_comes_to_rest_and_keeps_the_volume() -> None:
     pytest.importorskip("aeolis")
     before = cliff(6)
     found = aeolis_rest(before, **NUMBERS)
+    assert found.sweeps is not None
     assert found.sweeps > 0
     assert found.height.sum() == pytest.approx(before.sum(), rel=1e-12)
-    assert math.degrees(math.atan(steepest_rise(found.height) / 0.1)) <= 36.0
+    assert math.degrees(math.atan(steepest_rise(np.asarray(found.height)) / 0.1)) <= 36.0
 
 
 # --- the cases
@@ -164,7 +166,7 @@ def test_functions_are_timed_in_turn_on_every_case() -> None:
 
 
 def test_no_more_passes_are_made_than_asked_for() -> None:
-    calls = []
+    calls: list[int] = []
     timed([calls.append], [(1,)], seconds=60.0, most=3, warm=True)
     assert len(calls) == 3
 
@@ -219,6 +221,7 @@ def test_an_unknown_item_is_refused() -> None:
 @pytest.mark.slow
 def test_rollouts_of_a_gpu_can_be_counted_anywhere() -> None:
     measured = measure_rollouts(Setup(seed=0, quick=True), 2)
+    assert measured.run is not None
     expected = 2 * 40 / measured.run.median
     assert measured.figures["loads_per_second"] == pytest.approx(expected)
 
@@ -230,7 +233,8 @@ def strict_json(text: str) -> dict[str, Any]:
     def fail(constant: str) -> NoReturn:
         raise AssertionError(f"{constant} in JSON")
 
-    return json.loads(text, parse_constant=fail)
+    document: dict[str, Any] = json.loads(text, parse_constant=fail)
+    return document
 
 
 def numbers(value: Any) -> list[float]:

@@ -164,7 +164,8 @@ def strict_json(text: str) -> dict[str, Any]:
     def fail(constant: str) -> NoReturn:
         raise AssertionError(f"{constant} in JSON")
 
-    return json.loads(text, parse_constant=fail)
+    document: dict[str, Any] = json.loads(text, parse_constant=fail)
+    return document
 
 
 # --- plan
@@ -414,7 +415,7 @@ def test_a_map_is_written(
 def test_the_high_world_takes_both_of_its_models(
     run: Run, scan: str, monkeypatch: pytest.MonkeyPatch, command: tuple[object, ...]
 ) -> None:
-    asked = []
+    asked: list[tuple[str, str | None, str | None]] = []
 
     def load_world(name: str, **options: Any) -> FakeWorld:
         asked.append((name, options.get("model"), options.get("pile_state")))
@@ -430,7 +431,8 @@ def test_the_high_world_takes_both_of_its_models(
     assert (document["model"], document["pile_state"]) == (given["psi_high"], given["phi"])
     asked.clear()
     code, out, _ = run(*words)
-    assert asked[0] == ("high", None, None)
+    first, *_ = asked
+    assert first == ("high", None, None)
     assert not {"model", "pile_state"} & set(strict_json(out))
 
 
@@ -708,7 +710,7 @@ def test_the_report_stands_alone_and_escapes_names(run: Run, tmp_path: Path) -> 
     page = Page(source)
     assert name in page.text
     assert len(page.links) == 2
-    assert all(link.startswith("data:image/png;base64,") for link in page.links)
+    assert all((link or "").startswith("data:image/png;base64,") for link in page.links)
     assert "script" not in page.tags
 
 
@@ -716,7 +718,7 @@ def test_progress_tells_rate_and_remaining_time(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = iter([0.0, 30.0, 41.0, 60.0, 71.0])
-    monkeypatch.setattr(cli.progress.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     with cli.progress.Progress() as progress:
         # 100 were there; the first 10 took 30 s, compiling included, and do not count.
         for done in (100, 110, 132, 170, 192):

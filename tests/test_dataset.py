@@ -54,6 +54,7 @@ from wlplan.dataset.worker_pool import CollectionSettings, FinishedEpisode, Work
 from wlplan.engines.simulator import STOP_REASONS, Simulator
 from wlplan.engines.simulator.cycle import Settings
 from wlplan.errors import InputError
+from wlplan.io import provenance
 from wlplan.models.normaliser import Normaliser
 from wlplan.site.machine import WA320
 from wlplan.site.soil import GRAVEL
@@ -80,7 +81,7 @@ def _short_episodes() -> Iterator[None]:
 @pytest.fixture(scope="module", autouse=True)
 def kept_workers() -> Iterator[list[WorkerProcess]]:
     """All workers of this module; they stay from one collection to the next, so compile once."""
-    kept = []
+    kept: list[WorkerProcess] = []
 
     @contextlib.contextmanager
     def pool(count: int) -> Iterator[list[WorkerProcess]]:
@@ -240,7 +241,8 @@ def test_the_volume_that_the_map_loses_is_about_the_load(data: Dataset) -> None:
 
 def simulated(episode: Episode) -> Episode:
     """An episode after all its loadings, with no other beside it."""
-    episodes, finished = iter([episode]), []
+    episodes = iter([episode])
+    finished: list[Episode | None] = []
     vector_simulator.VectorSimulator(
         Simulator(), lambda: next(episodes, None), finished.append, threading.Event()
     ).run()
@@ -252,9 +254,10 @@ def test_an_episode_does_not_depend_on_those_beside_it(
     data: Dataset, worker: WorkerProcess
 ) -> None:
     for number in (0, 2):
-        numbers, finished = iter([number]), []
+        numbers = iter([number])
+        finished: list[Any] = []
         settings = CollectionSettings(Simulator(), SEED, 3, 3)
-        worker.simulate(settings, lambda numbers=numbers: next(numbers, None), finished.append)
+        worker.simulate(settings, functools.partial(next, numbers, None), finished.append)
         *loadings, (found, alone) = finished
         assert loadings == [None] * 3
         assert found == number
@@ -294,7 +297,7 @@ def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike() 
 def test_a_corridor_is_dug_on_where_it_was_dug_before(worker: WorkerProcess) -> None:
     def nearest(protocol: str) -> tuple[float, list[np.ndarray]]:
         """Median distance of a loading from the nearest before it."""
-        finished = []
+        finished: list[FinishedEpisode | None] = []
         settings, numbers = CollectionSettings(Simulator(), SEED, 12, 12, protocol), iter([0, 1])
         worker.simulate(settings, lambda: next(numbers, None), finished.append)
         episodes = sorted(episode for episode in finished if episode is not None)
@@ -327,15 +330,16 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(
         last = None
         for load in range(30):
             _, action = mine.next_loading()
-            assert (action >= np.float32(ACTION_LOW)).all()
-            assert (action <= np.float32(ACTION_HIGH)).all()
+            assert (action >= np.asarray(ACTION_LOW, np.float32)).all()
+            assert (action <= np.asarray(ACTION_HIGH, np.float32)).all()
             new = np.array_equal(action, papers.action[load])
             assert new or last is not None  # none was slow: as in the paper's protocol
             if last is not None:
                 count += 1
                 fresh += new
                 # Those at the edge of the range would have gone beyond it.
-                inside = (action > np.float32(ACTION_LOW)) & (action < np.float32(ACTION_HIGH))
+                low, high = (np.asarray(ends, np.float32) for ends in (ACTION_LOW, ACTION_HIGH))
+                inside = (action > low) & (action < high)
                 if not new:
                     middle = np.abs(last - np.array(ACTION_LOW) - 0.5 * span) < 0.2 * span
                     steps.extend(((action - last) / span)[inside & middle])
@@ -353,7 +357,7 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(
 
 def test_up_to_the_first_slow_loading_the_protocol_is_the_papers(worker: WorkerProcess) -> None:
     def episodes(protocol: str) -> list[FinishedEpisode]:
-        finished = []
+        finished: list[FinishedEpisode | None] = []
         settings, numbers = CollectionSettings(Simulator(), SEED, 20, 20, protocol), iter([0, 1])
         worker.simulate(settings, lambda: next(numbers, None), finished.append)
         return sorted(episode for episode in finished if episode is not None)
@@ -406,7 +410,9 @@ def test_nothing_is_chosen_where_nothing_is_left() -> None:
 @pytest.mark.parametrize("place", [0.0, 0.5, 1.0])
 def test_a_pose_heads_into_the_pile(place: float) -> None:
     pile = seed_pile("conical", slope=math.radians(30.0), noise=0.0)
-    x, y, heading = choose_pose(pile, place, 0.1)
+    pose = choose_pose(pile, place, 0.1)
+    assert pose is not None
+    x, y, heading = pose
     inward = math.atan2(-y, -x)
     assert abs((heading - inward + math.pi) % (2.0 * math.pi) - math.pi) == pytest.approx(
         0.1, abs=0.05
@@ -523,6 +529,8 @@ def test_the_end_of_a_worker_is_said_in_one_line(
 def test_a_worker_ends_with_its_collector() -> None:
     """Whatever way that ends: all it sees is the end of its input."""
     worker = WorkerProcess()
+    assert worker.process.stdin is not None
+    assert worker.process.stdout is not None
     worker.process.stdin.close()
     assert worker.process.wait(timeout=300.0) == 0
     worker.process.stdout.close()
@@ -962,9 +970,10 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str]) ->
 def cycles_done(path: Path) -> int:
     """Number of cycles in a store so far; -1 without a store."""
     try:
-        return json.loads((path / "zarr.json").read_text())["attributes"]["cycles_done"]
+        document = json.loads((path / "zarr.json").read_text())
     except FileNotFoundError:
         return -1
+    return int(document["attributes"]["cycles_done"])
 
 
 @pytest.mark.slow
@@ -975,7 +984,11 @@ def test_a_killed_shard_goes_on_and_ends_with_the_same_bytes(tmp_path: Path) -> 
     command = ("--cycles", cycles, "--seed", SEED, "--shard", "2/2", "--out", path)
     for least in (0, 6, 120):
         process = start(*command)
-        wait_until(lambda least=least: cycles_done(path) >= least, process)
+
+        def is_there(least: int = least) -> bool:
+            return cycles_done(path) >= least
+
+        wait_until(is_there, process)
         process.send_signal(signal.SIGKILL)
         process.communicate()
         assert process.returncode == -signal.SIGKILL
@@ -1077,6 +1090,6 @@ def test_the_command_is_one_to_type_again(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("sys.argv", ["/somewhere/bin/wlplan", "collect", "--out", "my data.zarr"])
     main = types.ModuleType("__main__")
     monkeypatch.setitem(sys.modules, "__main__", main)
-    assert stored.command() == "wlplan collect --out 'my data.zarr'"
+    assert provenance.command() == "wlplan collect --out 'my data.zarr'"
     main.__spec__ = importlib.machinery.ModuleSpec("wlplan.__main__", None)
-    assert stored.command() == "python -m wlplan collect --out 'my data.zarr'"
+    assert provenance.command() == "python -m wlplan collect --out 'my data.zarr'"

@@ -476,7 +476,7 @@ def test_a_broken_file_of_the_cache_is_played_again(
 def test_what_the_engine_does_not_see_is_told(
     jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
 ) -> None:
-    told = []
+    told: list[str] = []
     pile = wide_pile()
     high = pile.replace(height=2.0 * pile.height)
     next(loads(DiscreteElements(), high, plan_of(1), told.append))
@@ -500,7 +500,8 @@ def test_play_goes_load_by_load_and_hands_on_notes_and_records(
     jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
 ) -> None:
     world, pile, plan = DiscreteElements(soil=SAND), wide_pile(), plan_of(2)
-    notes, records = [], []
+    notes: list[str] = []
+    records: list[Any] = []
     result = play(
         world, pile, plan, note=notes.append, record=lambda *record: records.append(record)
     )

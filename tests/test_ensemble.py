@@ -21,6 +21,7 @@ from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.training import (
+    EvaluationReport,
     PsiHighSettings,
     PsiLowSettings,
     evaluate_performance,
@@ -28,12 +29,11 @@ from wlplan.training import (
     held_out,
     train,
 )
-from wlplan.training.evaluation import EvaluationReport
 from wlplan.types import LoadingPlan, LocalHeightmap, Performance, Pile, Pose, action_from
 from wlplan.worlds.learned import LearnedWorld
 
 MEMBERS = 5
-LIGHT = {
+LIGHT: dict[str, Any] = {
     "epochs": 30,
     "batch": 160,
     "hidden": (128,),
@@ -84,6 +84,7 @@ def saved(
 ) -> tuple[Path, Ensemble, EvaluationReport]:
     directory = tmp_path_factory.mktemp("ensemble") / "psi_low"
     model, report = train(PsiLowSettings(**LIGHT), data, out=directory)
+    assert isinstance(report, EvaluationReport)
     return directory, model, report
 
 
@@ -95,6 +96,7 @@ def test_nine_in_ten_held_out_cycles_lie_inside_the_interval(
     saved: tuple[Path, Ensemble, EvaluationReport],
 ) -> None:
     report = saved[2]
+    assert report.intervals is not None
     assert set(report.intervals) == {"mass", "time", "work"}
     for interval in report.intervals.values():
         assert 0.85 <= interval.coverage <= 0.95
@@ -118,6 +120,7 @@ def test_the_check_of_the_interval_can_fail(
     model = saved[1]
     narrow = model.replace(factor=0.3 * model.factor)
     report = evaluate_performance(narrow, held_out(data, read_description(saved[0])))
+    assert report.intervals is not None
     assert all(interval.coverage < 0.6 for interval in report.intervals.values())
 
 
@@ -126,11 +129,11 @@ def test_an_ensemble_is_the_mean_of_its_members_which_differ(
 ) -> None:
     model = saved[1]
     view = jnp.array([0.4, 0.5, 0.0, 0.1])
-    each = []
+    told = []
     for k in range(model.size):
         params = jax.tree.map(lambda leaf, k=k: leaf[k], model.members.params)
-        each.append(flat(model.members.replace(params=params).of_view(view, ACTION)))
-    each = np.stack(each)
+        told.append(flat(model.members.replace(params=params).of_view(view, ACTION)))
+    each = np.stack(told)
     assert len(each) == MEMBERS
     assert (each.std(axis=0) > 1e-4).all()
     np.testing.assert_allclose(flat(model.of_view(view, ACTION)), each.mean(axis=0), rtol=1e-5)
@@ -168,7 +171,7 @@ def test_an_ensemble_comes_back_bit_by_bit(saved: tuple[Path, Ensemble, Evaluati
     directory, model, _ = saved
     loaded = load_model(directory)
     assert isinstance(loaded, Ensemble)
-    assert jax.tree.structure(loaded) == jax.tree.structure(model)
+    assert jax.tree.structure(loaded) == jax.tree.structure(model)  # type: ignore[operator]
     for got, want in zip(jax.tree.leaves(loaded), jax.tree.leaves(model), strict=True):
         np.testing.assert_array_equal(got, want)
     description = read_description(directory)
@@ -266,6 +269,7 @@ def test_a_world_of_a_single_model_does_not(data: Dataset, site: tuple[Pile, Pos
 
 def test_without_intervals_a_report_is_as_it_was(data: Dataset) -> None:
     single, report = train(PsiLowSettings(**(LIGHT | {"epochs": 1, "members": 1})), data)
+    assert isinstance(report, EvaluationReport)
     assert report.intervals is None
     assert "intervals" not in report.as_dict()
     assert dataclasses.asdict(report)["intervals"] is None

@@ -2,7 +2,7 @@
 
 import json
 
-import jax.numpy as jnp
+import numpy as np
 import pytest
 from flax import nnx
 from test_pile_state import model_of
@@ -27,8 +27,8 @@ def data() -> Dataset:
 
 def psi_low(data: Dataset) -> LowPerformanceModel:
     graph, params = nnx.split(PsiLow((8,), rngs=nnx.Rngs(0)))
-    ranges = Normaliser.of(jnp.concatenate([data.characteristics, data.action], axis=1))
-    table = jnp.stack([data.mass, data.time, data.work], axis=1)
+    ranges = Normaliser.of(np.concatenate([data.characteristics, data.action], axis=1))
+    table = np.stack([data.mass, data.time, data.work], axis=1)
     return LowPerformanceModel(
         params=params, graph=graph, inputs=ranges, outputs=Normaliser.of(table)
     )

@@ -35,6 +35,7 @@ def test_a_model_is_trained_once_and_found_again(
     data = synthetic(rollouts=10, loads=6)
     settings = PsiLowSettings(activation="swish", epochs=1, hidden=(4,))
     first, seconds = trained(tmp_path, data, settings)
+    assert seconds is not None
     assert seconds > 0.0
     with monkeypatch.context() as patched:
         patched.setattr("wlplan.training.train", breaks)

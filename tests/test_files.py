@@ -86,7 +86,7 @@ def failing(
             real(source, goal)
         raise error
 
-    monkeypatch.setattr(files.os, "replace", replace)
+    monkeypatch.setattr(os, "replace", replace)
 
 
 # --- where nothing is
@@ -219,7 +219,7 @@ def test_files_that_cannot_all_be_added_are_not_added(
         def no_links(*_: object, **__: object) -> None:
             raise OSError(errno.EPERM, "no links here")
 
-        monkeypatch.setattr(files.os, "link", no_links)
+        monkeypatch.setattr(os, "link", no_links)
     failing(monkeypatch, which, after=after)
 
     def add() -> None:

@@ -31,6 +31,7 @@ from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import toe_contour
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 from wlplan.worlds import library as worlds
+from wlplan.worlds.capabilities import with_derivatives
 
 
 @jax.custom_vjp
@@ -42,7 +43,7 @@ def misled(x: jax.Array, factor: jax.Array) -> jax.Array:
 misled.defvjp(lambda x, factor: (x, factor), lambda factor, g: (factor * g, jnp.zeros_like(factor)))
 
 
-class SmoothWorld(struct.PyTreeNode):
+class SmoothWorld(struct.PyTreeNode):  # type: ignore[no-untyped-call]
     """Each loading takes a part of the whole pile; smooth but for what a test asks for."""
 
     error: Any = 0.0  # relative error of the derivative in k_bm
@@ -225,9 +226,11 @@ def test_progress_reaches_the_end(pile: Pile) -> None:
 
 
 def test_the_simulator_gets_its_derivatives() -> None:
-    assert gradcheck.differentiable(Simulator()).settings.differentiable
+    found = with_derivatives(Simulator())
+    assert isinstance(found, Simulator)
+    assert found.settings.differentiable
     world = SmoothWorld()
-    assert gradcheck.differentiable(world) is world
+    assert with_derivatives(world) is world
 
 
 # --- the command
@@ -315,7 +318,9 @@ def test_the_command_and_the_module_agree() -> None:
     """The command repeats these to keep help fast."""
     defaults = {option.name: option for option in cli.wlplan.commands["gradcheck"].params}
     assert defaults["step"].default == gradcheck.STEP
-    help_text = defaults["tolerance"].help.replace("e-0", "e-")
+    help_text = defaults["tolerance"].help
+    assert help_text is not None
+    help_text = help_text.replace("e-0", "e-")
     for tolerance in (gradcheck.TOLERANCE, gradcheck.SIMULATOR_TOLERANCE):
         assert f"{tolerance:.0e}".replace("e-0", "e-") in help_text
 

@@ -99,7 +99,7 @@ def test_tilt_moment_is_the_virtual_work_of_a_small_tilt(
 
 
 def test_an_actuator_slows_down_and_stalls() -> None:
-    speed = [float(loader.actuator_speed(*scalars(x), 100.0)) for x in (-50, 0, 90, 95, 100, 150)]
+    speed = [float(loader.actuator_speed(scalars(x)[0], 100.0)) for x in (-50, 0, 90, 95, 100, 150)]
     np.testing.assert_allclose(speed, [1, 1, 1, 0.5, 0, 0], atol=1e-6)
 
 
@@ -115,11 +115,11 @@ def test_drive_respects_traction_power_and_the_travel_speed() -> None:
             assert thrust * (speed + slip) <= WA320.wheel_power * (1 + 1e-5)
             if thrust < 0.9 * traction:
                 assert slip == 0.0
-    thrust, slip = loader.drive(WA320, *scalars(WA320.travel_speed, 0.0))
+    thrust, slip = map(float, loader.drive(WA320, *scalars(WA320.travel_speed, 0.0)))
     assert thrust == 0.0
     assert slip == 0.0
     # At standstill traction is the limit, and the wheels slip as far as is allowed.
-    thrust, slip = loader.drive(WA320, *scalars(0.0, 0.0))
+    thrust, slip = map(float, loader.drive(WA320, *scalars(0.0, 0.0)))
     assert thrust == pytest.approx(WA320.traction * WA320.mass * GRAVITY)
     assert slip == pytest.approx(WA320.slip_speed)
 

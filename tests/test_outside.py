@@ -83,7 +83,8 @@ def command(folder: Path, *words: object) -> dict[str, Any]:
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
     )
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    document: dict[str, Any] = json.loads(done.stdout)
+    return document
 
 
 def test_planner_objective_and_world_run_from_the_command_line(folder: Path) -> None:

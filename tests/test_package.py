@@ -90,11 +90,12 @@ def test_every_public_name_exists_where_the_package_says() -> None:
     """Read off the files, since importing all of them takes seconds."""
     import wlplan
 
-    public = set()
+    public: set[str] = set()
     for node in ast.parse((PACKAGE / "__init__.pyi").read_text()).body:
         if not isinstance(node, ast.ImportFrom):
             continue
         # Its modules, and what it defines.
+        assert node.module is not None
         inside = f"{node.module}."
         defined = {name.removeprefix(inside) for name in FILES if name.startswith(inside)}
         for inner in ast.parse(FILES[node.module].read_text()).body:
@@ -107,9 +108,9 @@ def test_every_public_name_exists_where_the_package_says() -> None:
         names = {alias.name for alias in node.names}
         assert names <= defined, (node.module, names - defined)
         public |= names
-    assert set(wlplan.__all__) == public <= set(dir(wlplan))
+    assert set(wlplan.__all__) == public <= set(dir(wlplan))  # type: ignore[attr-defined]
     with pytest.raises(AttributeError, match="no_such_name"):
-        _ = wlplan.no_such_name
+        _ = wlplan.no_such_name  # type: ignore[attr-defined]
 
 
 def test_the_checks_of_docstrings_and_prints_can_fail() -> None:

@@ -8,7 +8,7 @@ import operator
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def performance(mass: float, time: float, work: float, **more: float) -> dict[st
     return {"mass": mass, "time": time, "work": work, **more}
 
 
-DOCUMENT = {
+DOCUMENT: dict[str, Any] = {
     "format": "wlplan.plan/1",
     "pile": {"file": "scan.npz", "sha256": "0a1b", "cells": [190, 160], "cell_size": 0.1},
     "soil": {"name": "gravel", "density": 1700.0},
@@ -83,7 +83,7 @@ def places(value: Any, *way: str | int) -> Iterator[tuple[Way, Any]]:
 def changed(way: Way, *value: Any) -> dict[str, Any]:
     """The document with another value at the end of a way; without one it is taken out."""
     document = copy.deepcopy(DOCUMENT)
-    inner = functools.reduce(operator.getitem, way[:-1], document)
+    inner = functools.reduce(operator.getitem, way[:-1], cast("Any", document))
     if value:
         (inner[way[-1]],) = value
     else:
@@ -136,7 +136,8 @@ def test_every_text_is_escaped() -> None:
     document = copy.deepcopy(DOCUMENT)
     for way, value in places(DOCUMENT):
         if isinstance(value, str):
-            functools.reduce(operator.getitem, way[:-1], document)[way[-1]] = HOSTILE
+            inner = functools.reduce(operator.getitem, way[:-1], cast("Any", document))
+            inner[way[-1]] = HOSTILE
     document["pile"][HOSTILE] = [HOSTILE]
     source = render_report(
         document, figures=[(b"", HOSTILE), (b"", HOSTILE)], settings={HOSTILE: HOSTILE}

@@ -54,7 +54,8 @@ def pile_of(
 
 
 def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.abs((a - b + math.pi) % (2.0 * math.pi) - math.pi)
+    angle: np.ndarray = np.abs((a - b + math.pi) % (2.0 * math.pi) - math.pi)
+    return angle
 
 
 def assert_one_line(error: pytest.ExceptionInfo[InputError]) -> None:
@@ -204,7 +205,7 @@ def test_resampling_keeps_affine_surfaces(cell: float) -> None:
     )
     want = 1.0 + 0.3 * x[:, np.newaxis] - 0.2 * y
     np.testing.assert_allclose(new.height, want, atol=1e-5)
-    np.testing.assert_allclose(new.ground, want - 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(new.ground), want - 1.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("cell", [0.05, 0.2])

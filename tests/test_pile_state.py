@@ -1,6 +1,7 @@
 """Laws of the pile state predictors: mass exact, never below ground, finite on flat ground."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ from wlplan.terrain.automaton import relax
 from wlplan.terrain.automaton.slopes import steepest_slope
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
-from wlplan.training import PhiSettings, PhiVaeSettings, evaluate_pile_state, train
+from wlplan.training import PhiSettings, PhiVaeSettings, PileStateErrors, evaluate_pile_state, train
 from wlplan.types import LocalHeightmap, Pile, Pose, action_from
 from wlplan.worlds.learned import LearnedWorld
 
@@ -198,8 +199,9 @@ def data() -> Dataset:
 
 
 def test_training_learns_the_change_and_a_model_comes_back(data: Dataset, tmp_path: Path) -> None:
-    settings = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
+    settings: dict[str, Any] = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
     model, errors = train(PhiSettings(epochs=30, **settings), data, out=tmp_path / "phi")
+    assert isinstance(errors, PileStateErrors)
     unchanged = np.abs(data.h52 - data.h52_after).sum(axis=(1, 2)).mean() * 0.01
     assert errors.mean_absolute < 0.2 * unchanged
     assert abs(errors.total_volume) < 1e-4
@@ -237,6 +239,7 @@ def test_what_a_code_holds_of_a_map_moves_with_it(data: Dataset) -> None:
     # The decoder alone tells what comes out: one that always says 0 leaves the least height.
     for layer in phi.vae.up:
         layer.kernel[...] = jnp.zeros_like(layer.kernel)
+        assert layer.bias is not None
         layer.bias[...] = jnp.zeros_like(layer.bias)
     empty = VaePileStateModel(nnx.split(phi)[1], graph).reconstruction(local(height))
     np.testing.assert_allclose(empty - phi.mean[...], (height - phi.mean[...]).min(), atol=1e-5)
@@ -246,6 +249,7 @@ def test_both_stages_of_the_paper_are_trained(data: Dataset, tmp_path: Path) -> 
     done = []
     settings = PhiVaeSettings(epochs=2, hidden=(16,))
     _, errors = train(settings, data, out=tmp_path / "vae", progress=lambda *n: done.append(n))
+    assert isinstance(errors, PileStateErrors)
     assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert np.isfinite(errors.mean_absolute)
     load_model(tmp_path / "vae", "phi_vae")
@@ -256,6 +260,7 @@ def test_both_stages_of_the_paper_are_trained(data: Dataset, tmp_path: Path) -> 
 def psi_high() -> HighPerformanceModel:
     psi = PsiHigh((16,), encoder="principal", rngs=nnx.Rngs(0))
     # A load of about a tonne, and some that hangs on the inputs.
+    assert psi.head.output.bias is not None
     psi.head.output.bias[...] = jnp.full(3, 0.15)
     psi.head.output.kernel[...] = 0.05 * psi.head.output.kernel[...]
     graph, params = nnx.split(psi)
@@ -269,11 +274,12 @@ def psi_high() -> HighPerformanceModel:
 
 
 def first_loading(pile: Pile) -> Pose:
-    return jax.tree.map(lambda leaf: leaf[0], edge_poses(toe_contour(pile), 1))
+    pose: Pose = jax.tree.map(lambda leaf: leaf[0], edge_poses(toe_contour(pile), 1))
+    return pose
 
 
 def removed(pile: Pile, after: Pile) -> float:
-    volume = np.asarray(pile.height - after.height, np.float64).sum() * pile.cell_size**2
+    volume = float(np.asarray(pile.height - after.height, np.float64).sum()) * pile.cell_size**2
     return volume * GRAVEL.density / 1000.0
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -135,7 +136,7 @@ def test_another_pile_on_the_same_grid_needs_no_compiling(caplog: pytest.LogCapt
             plan_loads(bowl_world, pile, loads=1, planner=GREEDY)
         return [r.getMessage() for r in caplog.records if "XLA compilation" in r.getMessage()]
 
-    jax.clear_caches()
+    jax.clear_caches()  # type: ignore[no-untyped-call]
     assert compilations(first)
     assert not compilations(second)
 
@@ -193,7 +194,7 @@ def test_a_referee_has_the_last_word_among_the_candidates() -> None:
         gain = action_vector(action) @ np.array([0.0, 1.0, 0.0, 0.0])
         return after, performance.replace(mass=performance.mass * (0.5 + 0.2 * gain))
 
-    options = {
+    options: dict[str, Any] = {
         "loads": 2,
         "planner": GRADIENT,
         "contour": circle(),
@@ -210,6 +211,8 @@ def test_a_referee_has_the_last_word_among_the_candidates() -> None:
     )
     assert alone.refereed is None
     # The greedy plan is among the candidates, and the limit in the planner's own world.
+    assert judged.refereed is not None
+    assert greedy.refereed is not None
     assert judged.refereed.cost <= greedy.refereed.cost * (1 + 1e-6)
     assert judged.cost <= greedy.cost * (1 + 1e-5)
     # What the referee saw is the plan, with the poses of the result.

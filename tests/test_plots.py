@@ -5,17 +5,19 @@ import math
 import struct
 import zlib
 from pathlib import Path
+from typing import cast
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from wlplan.errors import InputError
-from wlplan.planning.transport import Receiver
 from wlplan.report import figures as plots
 from wlplan.report.figures.digs import _first_crossing, _on_pile, label_places
 from wlplan.report.figures.relief import _relief
+from wlplan.site.receiver import Receiver
 from wlplan.studies.diggability import DiggabilityMap
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
@@ -148,7 +150,7 @@ def test_a_diggability_map_is_drawn_also_where_all_is_the_same(pile: Pile, sprea
     pose = edge_poses(toe_contour(pile), 30)
     performance = Performance(*(2.0 + spread * np.linspace(0.0, 1.0, 30) for _ in range(3)))
     figure = drawn(plots.diggability_figure(pile, DiggabilityMap(pose, performance)))
-    assert sum(patch.get_height() for patch in figure.axes[3].patches) == 30
+    assert sum(cast("Rectangle", patch).get_height() for patch in figure.axes[3].patches) == 30
 
 
 def test_a_map_of_one_location_is_drawn(pile: Pile) -> None:

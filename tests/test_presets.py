@@ -234,8 +234,9 @@ def test_every_field_refuses_nonsense_by_its_name(
     check: Callable[[Any], None], preset: Soil | WheelLoader, value: float
 ) -> None:
     for field in dataclasses.fields(preset):
-        wrong = dataclasses.replace(preset, **{field.name: value})
-        assert refused(lambda w=wrong: check(w)).startswith(f"{field.name} is ")
+        change: dict[str, Any] = {field.name: value}
+        wrong = dataclasses.replace(preset, **change)
+        assert refused(functools.partial(check, wrong)).startswith(f"{field.name} is ")
 
 
 def test_a_world_refuses_what_makes_no_sense() -> None:
@@ -248,7 +249,7 @@ def test_a_world_refuses_what_makes_no_sense() -> None:
 @pytest.mark.parametrize("name", ["simulator", "low"])
 def test_a_world_has_the_soil_and_machine_it_is_given(name: str) -> None:
     narrow = dataclasses.replace(WA320, bucket_width=1.8)
-    world = wlplan.load_world(name, soil=SAND, machine=narrow)
+    world: Any = wlplan.load_world(name, soil=SAND, machine=narrow)
     assert (world.soil, world.machine) == (SAND, narrow)
     world = wlplan.load_world(name)
     assert (world.soil, world.machine) == (GRAVEL, WA320)

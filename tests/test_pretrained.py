@@ -12,15 +12,16 @@ import numpy as np
 import pytest
 
 from wlplan import cli
-from wlplan.dataset import VARIABLES, Dataset, probes, probes_of, simulator_changes
+from wlplan.dataset import VARIABLES, Dataset, fingerprint, probes, probes_of, simulator_changes
 from wlplan.errors import InputError
+from wlplan.io.provenance import versions
 from wlplan.models.storage import load_model, read_description
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
-from wlplan.training import train_all, weights
-from wlplan.training.settings import Settings
+from wlplan.training import Settings, train_all, weights
 from wlplan.types import action_from
+from wlplan.worlds.learned import LearnedWorld
 from wlplan.worlds.library import load_world, pretrained_path
 from wlplan.worlds.names import WORLDS, Learned
 
@@ -60,8 +61,8 @@ def test_the_check_can_fail(data: list[dict[str, Any]], monkeypatch: pytest.Monk
         "the data set had no cycles to compare with"
     ]
     soil = {**data[0]["soil"], "friction": 0.5, "stickiness": 1.0}
-    found = simulator_changes({**data[0], "probes": some, "soil": soil})
-    assert [entry.split()[0] for entry in found] == ["soil.friction", "soil.stickiness"]
+    changes = simulator_changes({**data[0], "probes": some, "soil": soil})
+    assert [entry.split()[0] for entry in changes] == ["soil.friction", "soil.stickiness"]
 
 
 def test_probes_are_of_every_seed_pile(data: list[dict[str, Any]]) -> None:
@@ -84,6 +85,7 @@ def test_all_weights_together_are_small() -> None:
 @pytest.mark.parametrize("name", LEARNED)
 def test_every_learned_world_is_there_and_loads_a_bucket(name: str) -> None:
     world = load_world(name)
+    assert isinstance(world, LearnedWorld)
     pile = relax(seed_pile("conical", slope=np.radians(30.0), height=2.5))
     pose = jax.tree.map(lambda leaf: leaf[0], edge_poses(toe_contour(pile), 1))
     action = action_from(jnp.array([0.3, 2.0, 0.2, 3.0]))
@@ -115,8 +117,8 @@ def test_a_model_for_another_grid_is_refused_in_one_line(kind: str, tmp_path: Pa
         with pytest.raises(InputError, match=next(iter(change))) as error:
             load_model(copy, kind)
         assert "\n" not in str(error.value)
-    for grid in ("fine", None):
-        (copy / "model.json").write_text(json.dumps({**document, "grid": grid}))
+    for wrong in ("fine", None):
+        (copy / "model.json").write_text(json.dumps({**document, "grid": wrong}))
         with pytest.raises(InputError, match="grid"):
             load_model(copy, kind)
 
@@ -125,7 +127,9 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The trainings themselves have tests of their own."""
-    collected, trained, told = [], [], []
+    collected: list[tuple[str, int, int, str]] = []
+    trained: list[str | tuple[str, int]] = []
+    told: list[tuple[object, ...]] = []
 
     def collect(
         path: Path, *, cycles: int, seed: int, protocol: str, progress: Callable[[int, int], None]
@@ -155,14 +159,14 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(
         trained.append((settings.kind, settings.seed))
         shutil.copytree(pretrained_path(settings.kind), out)
         document = json.loads((out / "model.json").read_text())
-        document["dataset"]["fingerprints"] = [weights.fingerprint(each) for each in dataset]
+        document["dataset"]["fingerprints"] = [fingerprint(each) for each in dataset]
         document["training"]["settings"] = settings.as_dict()
-        document["versions"] = weights.versions()
+        document["versions"] = versions()
         (out / "model.json").write_text(json.dumps(document))
         progress(1, 1)
 
     monkeypatch.setattr(weights, "train", train)
-    call = {"seed": 3, "progress": lambda *news: told.append(news)}
+    call: dict[str, Any] = {"seed": 3, "progress": lambda *news: told.append(news)}
     with pytest.raises(KeyboardInterrupt):
         train_all(tmp_path / "d.zarr", tmp_path / "out", **call)
     reports = train_all(tmp_path / "d.zarr", tmp_path / "out", **call)

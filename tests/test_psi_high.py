@@ -1,6 +1,7 @@
 """Laws of ψ_high: encoders, finite gradients on flat ground, training, its worlds."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from wlplan.site.soil import GRAVEL
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
-from wlplan.training import PsiHighSettings, train
+from wlplan.training import EvaluationReport, PsiHighSettings, train
 from wlplan.types import LocalHeightmap, action_from
 from wlplan.worlds.library import load_world
 
@@ -198,16 +199,17 @@ def cycles(rollouts: int = 40, loads: int = 8, seed: int = 0) -> Dataset:
     return Dataset(**columns, attributes={})
 
 
-SETTINGS = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
+SETTINGS: dict[str, Any] = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
 
 
 def test_training_reads_the_map_and_a_model_comes_back_bit_by_bit(tmp_path: Path) -> None:
     data = cycles()
     model, report = train(PsiHighSettings(epochs=20, **SETTINGS), data, out=tmp_path / "m")
+    assert isinstance(report, EvaluationReport)
     # Without the map nothing is known: the mean would be 11 % off.
     assert report.every.mean_relative["mass"] < 0.06
     loaded = load_model(tmp_path / "m", "psi_high")
-    assert jax.tree.structure(loaded) == jax.tree.structure(model)
+    assert jax.tree.structure(loaded) == jax.tree.structure(model)  # type: ignore[operator]
     for got, want in zip(jax.tree.leaves(loaded), jax.tree.leaves(model), strict=True):
         np.testing.assert_array_equal(got, want)
     assert [path.name for path in tmp_path.iterdir()] == ["m"]

@@ -29,7 +29,8 @@ def model_of(
 ) -> LowPerformanceModel:
     graph, params = nnx.split(PsiLow(hidden, rngs=nnx.Rngs(seed), **settings))
     # Large output weights, so that the untrained network asks for negative loads too.
-    params["output"]["kernel"][...] = 20.0 * params["output"]["kernel"][...]
+    output: Any = params["output"]
+    output["kernel"][...] = 20.0 * output["kernel"][...]
     inputs, outputs = (Normaliser.of(np.stack(rows)) for rows in ((LOW, HIGH), (OUT_LOW, OUT_HIGH)))
     return LowPerformanceModel(params, inputs, outputs, graph)
 
@@ -97,7 +98,8 @@ def test_a_model_is_a_pytree_that_passes_through_jit(model: LowPerformanceModel)
     call = jax.jit(lambda m, c, a: m.of_view(c, a))
     first = call(model, characteristics[0], action[0])
     call(model_of(seed=1), characteristics[0], action[0])
-    assert call._cache_size() == 1  # other weights are no other program
+    # Other weights are no other program.
+    assert call._cache_size() == 1  # type: ignore[attr-defined]
     np.testing.assert_allclose(
         as_rows(first), as_rows(model.of_view(characteristics[0], action[0])), rtol=1e-5
     )
@@ -114,7 +116,7 @@ def test_far_out_the_network_promises_nothing_new(model: LowPerformanceModel) ->
     sides = np.random.default_rng(0).choice([-1.0, 1.0], (50, INPUTS))
     far, farther = ((LOW + out * (HIGH - LOW) * sides).astype(np.float32) for out in (1e2, 1e6))
     rows = [as_rows(jax.vmap(model.of_view)(x[:, :4], x[:, 4:])) for x in (far, farther)]
-    np.testing.assert_allclose(*rows, rtol=1e-5)
+    np.testing.assert_allclose(rows[0], rows[1], rtol=1e-5)
 
 
 def test_the_network_does_ask_for_negative_loads(model: LowPerformanceModel) -> None:
@@ -127,8 +129,9 @@ def test_the_network_does_ask_for_negative_loads(model: LowPerformanceModel) -> 
 
 def test_the_floor_leaves_the_range_of_the_data_alone() -> None:
     params = model_of().params
-    params["output"]["kernel"][...] = 0.0 * params["output"]["kernel"][...]
-    params["output"]["bias"][...] = jnp.array([0.5, 0.0, 1.0])
+    output: Any = params["output"]
+    output["kernel"][...] = 0.0 * output["kernel"][...]
+    output["bias"][...] = jnp.array([0.5, 0.0, 1.0])
     flat = model_of().replace(params=params)
     rows = as_rows(flat.of_view(*(part[0] for part in inputs_of(1))))
     np.testing.assert_allclose(rows, [2.55, 6.5, 1300.0], rtol=1e-3)

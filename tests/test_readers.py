@@ -303,9 +303,9 @@ def test_endings_are_told_without_the_libraries_of_the_formats_or_jax(tmp_path: 
     assert in_a_process(code, tmp_path) == "[]"
 
 
-EXAMPLE = re.search(
+(EXAMPLE,) = re.findall(
     r"## Your own reader\n.*?```python\n(.*?)```", (ROOT / "docs/extending.md").read_text(), re.S
-).group(1)
+)
 
 
 @pytest.fixture

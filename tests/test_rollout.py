@@ -113,7 +113,7 @@ def test_it_passes_float64_and_gradients_in_plan_and_pile() -> None:
             plan, height = point
             outcome = rollout(fake_world, pile.replace(height=height), plan)
             assert outcome.performance.mass.dtype == jnp.float64
-            total = jax.tree.map(jnp.sum, outcome.performance)
+            total: Performance = jax.tree.map(jnp.sum, outcome.performance)
             return total.mass + total.time + total.work / 100.0 + (outcome.pile.height**2).sum()
 
         assert_gradient(cost, (plan_of(random_rows(2, 3), jnp.float64), pile.height[:, :]))
@@ -196,7 +196,7 @@ def in_float64(tree: Any) -> Any:
 def lost_mass(before: Pile, after: Pile) -> float:
     heights = (np.asarray(p.height, np.float64).sum() for p in (before, after))
     first, last = heights
-    return (first - last) * before.cell_size**2 * DENSITY
+    return float(first - last) * before.cell_size**2 * DENSITY
 
 
 def test_the_low_world_removes_what_it_loads(
@@ -349,7 +349,8 @@ def each_wild_plan(
         plans: How many.
         floor: Whether there is a sloping floor under the piles, and a corner that was not seen.
     """
-    heights, fields = jnp.asarray(small_piles()), {}
+    heights = jnp.asarray(small_piles())
+    fields: dict[str, Any] = {}
     if floor:
         i, j = np.indices((CELLS, CELLS))
         fields = {"ground": jnp.asarray(0.02 * CELL * i, jnp.float32), "valid": i + j > 12}

@@ -54,7 +54,7 @@ def test_what_a_setting_may_not_be_is_refused_in_one_line(
 
 @pytest.mark.parametrize(("value", "default"), [(1.5, 1), ("1", 1), (True, 1), (True, 1.0)])
 def test_a_setting_of_another_type_is_refused(value: object, default: object) -> None:
-    assert "has to be a" in Setting("Number.").complaint(value, default)
+    assert "has to be a" in (Setting("Number.").complaint(value, default) or "")
 
 
 def test_every_setting_is_an_option_with_the_defaults_of_the_kinds() -> None:
@@ -64,17 +64,23 @@ def test_every_setting_is_an_option_with_the_defaults_of_the_kinds() -> None:
 
     for option in training_options():
         command = option(command)
+    assert isinstance(command, click.Command)
     options = {option.name: option for option in command.params}
+    told = {
+        name: option.help or ""
+        for name, option in options.items()
+        if isinstance(option, click.Option)
+    }
     names = {field.name for kind in KINDS.values() for field in dataclasses.fields(kind)}
     assert set(options) == names - {"seed"}
     assert all(option.default is None for option in options.values())
-    assert "psi-low, psi-high 150; phi 100; phi-vae 40." in options["epochs"].help
-    assert options["members"].help.startswith("psi-low, psi-high: ")
-    assert options["hidden"].help.endswith("phi 512,512; phi-vae 1024,1024.")
+    assert "psi-low, psi-high 150; phi 100; phi-vae 40." in told["epochs"]
+    assert told["members"].startswith("psi-low, psi-high: ")
+    assert told["hidden"].endswith("phi 512,512; phi-vae 1024,1024.")
 
 
 def test_settings_of_two_kinds_are_never_the_same() -> None:
-    assert PsiLowSettings(dropout=0.1) != PsiHighSettings()
+    assert PsiLowSettings(dropout=0.1) != PsiHighSettings()  # type: ignore[comparison-overlap]
     assert PhiVaeSettings() == PhiVaeSettings(seed=0)
 
 

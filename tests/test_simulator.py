@@ -104,7 +104,7 @@ def loadings(seed_piles: list[tuple[Pile, ToeContour]]) -> Loadings:
     origins.append(np.asarray(pile.origin))
     poses.append([0.0, 0.0, 0.5])
 
-    poses = jnp.asarray(np.array(poses), jnp.float32)
+    places = jnp.asarray(np.array(poses), jnp.float32)
     piles = Pile(
         jnp.asarray(np.array(heights), jnp.float32),
         0.1,
@@ -112,7 +112,7 @@ def loadings(seed_piles: list[tuple[Pile, ToeContour]]) -> Loadings:
         ground=jnp.asarray(np.array(floors), jnp.float32),
     )
     actions = action_from(jnp.asarray(random_actions(rng, len(poses))))
-    inputs = piles, Pose(poses[:, 0], poses[:, 1], poses[:, 2]), actions
+    inputs = piles, Pose(places[:, 0], places[:, 1], places[:, 2]), actions
     play = jax.jit(jax.vmap(Simulator().play))
     seeds = POSES * len(seed_piles)
     uneven = seeds + 2 * len(seed_piles)
@@ -232,7 +232,8 @@ def bumpy(seed: int, slope: float = 26.0) -> np.ndarray:
     """A ramp with smooth random bumps, no two sides alike."""
     noise = np.random.default_rng(seed).normal(size=(52, 52))
     noise = ndimage.gaussian_filter(noise, 6.0)
-    return np.maximum(ramp(slope) * (1.0 + 0.5 * noise / noise.std() * 0.3), 0.0).astype(np.float32)
+    bumps: np.ndarray = np.maximum(ramp(slope) * (1.0 + 0.5 * noise / noise.std() * 0.3), 0.0)
+    return bumps.astype(np.float32)
 
 
 def batched(
@@ -256,9 +257,10 @@ def batched(
         n = len(actions)
         assert n <= batch
         fill = np.minimum(np.arange(batch), n - 1)
-        return jax.tree.map(
+        cycle: Cycle = jax.tree.map(
             lambda v: np.asarray(v)[:n], run(jnp.asarray(heights[fill]), jnp.asarray(actions[fill]))
         )
+        return cycle
 
     return call
 
@@ -438,11 +440,11 @@ def met_by(
     ground: float = 0.0,
 ) -> terrain.Reaction:
     """`terrain.reaction` against one surface, in double precision."""
-    height = terrain.rimmed(jnp.asarray(height, jnp.float64)[..., None])
+    rim = terrain.rimmed(jnp.asarray(height, jnp.float64)[..., None])
     fills = jnp.full((terrain.Lanes(WA320).count, 1), fill)
     bucket = terrain.Bucket(*(jnp.asarray([v]) for v in (x, z, tilt)))
-    ground = jnp.full_like(height, ground)
-    return terrain.reaction(WA320, soil, height, ground, fills, bucket, jnp.asarray(True))
+    floor = jnp.full_like(rim, ground)
+    return terrain.reaction(WA320, soil, rim, floor, fills, bucket, jnp.asarray(True))
 
 
 def test_a_level_floor_rests_on_the_soil_it_has_cut() -> None:
@@ -531,7 +533,7 @@ def test_cycles_advanced_in_parts_end_alike(digs: Callable[[Any, Any], Cycle]) -
     height = jnp.asarray(np.stack([bumpy(k) for k in range(8)], axis=-1))
     action = action_from(jnp.asarray(random_actions(rng, 8)))
     state = begin(height, jnp.zeros_like(height), action, WA320)
-    options = {"machine": WA320, "soil": GRAVEL, "settings": Settings()}
+    options: dict[str, Any] = {"machine": WA320, "soil": GRAVEL, "settings": Settings()}
     part, whole = (jax.jit(partial(advance, **options, steps=n)) for n in (7, 2000))
     once = whole(state)
     while not state.has_ended.all():

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -65,7 +65,7 @@ def random_cuts() -> Cuts:
 run = jax.jit(earthmoving_force, static_argnames=("soil", "surcharge"))
 
 
-def forces(cuts: Cuts, soil: Soil, surcharge: float = 0.0) -> np.ndarray:
+def forces(cuts: Sequence[np.ndarray], soil: Soil, surcharge: float = 0.0) -> np.ndarray:
     depth, rake, slope, friction = (jnp.asarray(v, jnp.float32) for v in cuts)
     force = run(depth, rake, slope, external_friction=friction, soil=soil, surcharge=surcharge)
     return np.asarray(force)
@@ -117,8 +117,8 @@ def test_it_is_the_minimum_over_the_failure_angle(
 def test_without_cohesion_it_is_coulombs_passive_pressure() -> None:
     """Coulomb's closed form, the surface turned level: same wedge, same plane of failure."""
     phi = ORACLE.friction
-    for rake, slope, delta in ((60, 0, 20), (80, 0, 20), (60, 0, 10), (60, 20, 20), (55, -8, 25)):
-        rake, slope, delta = (math.radians(v) for v in (rake, slope, delta))
+    for degrees in ((60, 0, 20), (80, 0, 20), (60, 0, 10), (60, 20, 20), (55, -8, 25)):
+        rake, slope, delta = (math.radians(v) for v in degrees)
         # The back of the wall stands at this angle over the horizontal, this high.
         wall = rake - slope
         rise = DEPTH / math.sin(rake) * math.sin(wall)
@@ -178,7 +178,8 @@ def gradient_case(
 
     def force(picked: jax.Array) -> jax.Array:
         full = point.at[jnp.asarray(pick)].set(picked)
-        return run(*full[:3], soil=GRAVEL, external_friction=full[3]).sum() / 1e3
+        total: jax.Array = run(*full[:3], soil=GRAVEL, external_friction=full[3]).sum() / 1e3
+        return total
 
     return force, point[jnp.asarray(pick)]
 

@@ -22,6 +22,7 @@ from wlplan.models.psi_low import LowPerformanceModel, PsiLow
 from wlplan.models.storage import load_model, read_description, save_model
 from wlplan.training import (
     LOSSES,
+    EvaluationReport,
     PsiLowSettings,
     evaluate_performance,
     fitting,
@@ -29,7 +30,6 @@ from wlplan.training import (
     shares_piles,
     train,
 )
-from wlplan.training.evaluation import EvaluationReport
 
 LIGHT = PsiLowSettings(epochs=40, batch=64, hidden=(32, 32), dropout=0.0, learning_rate=1e-2)
 ONE_EPOCH = dataclasses.replace(LIGHT, epochs=1)
@@ -69,6 +69,7 @@ def saved(
 ) -> tuple[Path, LowPerformanceModel, EvaluationReport]:
     directory = tmp_path_factory.mktemp("training") / "psi_low"
     model, report = train(LIGHT, data, out=directory)
+    assert isinstance(report, EvaluationReport)
     return directory, model, report
 
 
@@ -137,15 +138,17 @@ def test_the_same_seed_gives_the_same_weights_and_cycles_that_are_not_valid_play
             data, mass=np.where(valid, data.mass, np.float32(wrong)), valid=valid
         )
         model, report = train(settings, spoilt, progress=lambda *n: done.append(n))
+        assert isinstance(report, EvaluationReport)
         assert np.isfinite(report.every.mean_relative["mass"])
         models.append(leaves(model))
     assert done == [(1, 2), (2, 2)] * 2
-    assert all(np.array_equal(a, b) for a, b in zip(*models, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(models[0], models[1], strict=True))
 
 
 def test_the_validation_part_chooses_the_weights() -> None:
     """A learning rate that blows the network up late must not cost what was learnt before."""
-    graph, params, rest = nnx.split(PsiLow((8,), rngs=nnx.Rngs(0)), nnx.Param, ...)
+    graph, *states = nnx.split(PsiLow((8,), rngs=nnx.Rngs(0)), nnx.Param, ...)
+    params, rest = states
     optimiser = optax.sgd(1e3)
     fit = fitting.Fit(
         params, rest, optimiser.init(params), (params, rest), jnp.asarray(1e-9), jnp.asarray(7)
@@ -243,6 +246,7 @@ def test_a_data_set_that_begins_with_the_same_piles_is_noticed(
 def test_of_several_data_sets_each_has_its_own_test_part(data: Dataset, tmp_path: Path) -> None:
     other = synthetic(rollouts=20, seed=1)
     _, report = train(ONE_EPOCH, [data, other], out=tmp_path / "model")
+    assert isinstance(report, EvaluationReport)
     description = read_description(tmp_path / "model")
     parts = [held_out(each, description) for each in (data, other)]
     assert [len(set(part.rollout)) for part in parts] == [
@@ -289,7 +293,7 @@ def test_a_model_comes_back_bit_by_bit_and_the_directory_stays_as_it_is(
     directory, model, _ = saved
     before = contents(directory)
     loaded = load_model(directory)
-    assert jax.tree.structure(loaded) == jax.tree.structure(model)
+    assert jax.tree.structure(loaded) == jax.tree.structure(model)  # type: ignore[operator]
     for got, want in zip(leaves(loaded), leaves(model), strict=True):
         assert got.dtype == want.dtype == np.float32
         np.testing.assert_array_equal(got, want)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 
 import wlplan
 from wlplan.errors import InputError
+from wlplan.models.ensemble import Ensemble
 from wlplan.models.storage import load_model
 from wlplan.planning.plan import play
 from wlplan.terrain.automaton import Schedule, relax
@@ -36,7 +38,7 @@ def scene() -> Scene:
 
 def removed(before: Pile, after: Pile) -> float:
     heights = (np.asarray(pile.height, np.float64).sum() for pile in (before, after))
-    return -np.subtract(*reversed(list(heights))) * before.cell_size**2 * DENSITY
+    return -float(np.subtract(*reversed(list(heights)))) * before.cell_size**2 * DENSITY
 
 
 @pytest.mark.parametrize(
@@ -47,7 +49,11 @@ def test_every_predictor_goes_with_every_pile_state(
 ) -> None:
     pile, pose, action = scene
     model = load_model(pretrained_path(psi), psi)
-    state = Strip() if phi is None else load_model(pretrained_path(phi), phi)
+    state: Any = (
+        Strip()  # type: ignore[no-untyped-call]
+        if phi is None
+        else load_model(pretrained_path(phi), phi)
+    )
     world = wlplan.LearnedWorld(model, state)
     after, performance = world(pile, pose, action)
     assert 0.5 < float(performance.mass) < 8.0
@@ -69,8 +75,9 @@ def test_a_function_is_a_pile_state(scene: Scene) -> None:
         return -above * volume / (0.01 * above.sum())
 
     model = load_model(pretrained_path("psi_high"), "psi_high")
-    lowered.conserves_volume = True
-    world = wlplan.LearnedWorld(model, LocalChange(jax.tree_util.Partial(lowered)))
+    lowered.conserves_volume = True  # type: ignore[attr-defined]
+    partial: Any = jax.tree_util.Partial(lowered)  # type: ignore[no-untyped-call]
+    world = wlplan.LearnedWorld(model, LocalChange(partial))
     # A partial hides the attribute: the load is then what was predicted.
     after, performance = world(pile, pose, action)
     assert removed(pile, after) == pytest.approx(float(performance.mass), rel=0.02)
@@ -114,21 +121,25 @@ def test_worlds_say_whether_they_have_an_uncertainty(scene: Scene) -> None:
     def deviation(pile: Pile, pose: Pose, action: Action) -> Performance:
         return Performance(0.1 * pose.x, pose.y, pose.heading)
 
-    assert load_world("low").has_uncertainty
+    low = load_world("low")
+    assert isinstance(low, wlplan.LearnedWorld)
+    assert low.has_uncertainty
     assert not getattr(load_world("simulator"), "has_uncertainty", False)
     plain, sure = wlplan.world(mine), wlplan.world(mine, uncertainty=deviation)
     assert (plain.has_uncertainty, sure.has_uncertainty) == (False, True)
     assert float(sure.uncertainty(*scene).mass) == pytest.approx(0.1 * float(scene[1].x))
     with pytest.raises(InputError, match="uncertainty"):
         plain.uncertainty(*scene)
-    single = load_model(pretrained_path("psi_low"), "psi_low").members
+    ensemble = load_model(pretrained_path("psi_low"), "psi_low")
+    assert isinstance(ensemble, Ensemble)
+    single = ensemble.members
     one = single.replace(params=jax.tree.map(lambda leaf: leaf[0], single.params))
     assert not wlplan.LearnedWorld(one).has_uncertainty
 
 
 @pytest.mark.parametrize("name", ["low", "high", "simulator"])
 def test_a_solve_is_a_call_that_says_how_it_ended(scene: Scene, name: str) -> None:
-    world = load_world(name)
+    world: Any = load_world(name)
     after, performance, report = world.solve(*scene)
     same, also = world(*scene)
     np.testing.assert_array_equal(after.height, same.height)
@@ -142,10 +153,14 @@ def test_a_solve_is_a_call_that_says_how_it_ended(scene: Scene, name: str) -> No
 def test_a_played_plan_says_how_its_solves_ended(scene: Scene) -> None:
     pile, pose, action = scene
     plan = LoadingPlan(*jax.tree.map(lambda leaf: leaf[None], (pose, action)))
-    patient = play(load_world("low"), pile, plan).solves
+    low = load_world("low")
+    assert isinstance(low, wlplan.LearnedWorld)
+    patient = play(low, pile, plan).solves
+    assert patient is not None
     assert patient.settled.tolist() == [True]
     hasty = dataclasses.replace(Schedule(), most_rounds=1)
-    ended = play(load_world("low").replace(schedule=hasty), pile, plan).solves
+    ended = play(low.replace(schedule=hasty), pile, plan).solves
+    assert ended is not None
     assert ended.rounds.tolist() == [1]
     assert ended.settled.tolist() == [False]
     assert np.degrees(ended.steepest_slope[0]) > 33.5

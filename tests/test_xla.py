@@ -32,7 +32,7 @@ def test_rows_are_as_in_a_batch_and_in_their_order(count: int) -> None:
     for _ in range(2):
         got = each(shared, many)
         expected = jax.vmap(shifted, in_axes=(None, 0))(shared, many)
-        assert jax.tree.structure(got) == jax.tree.structure(expected)
+        assert jax.tree.structure(got) == jax.tree.structure(expected)  # type: ignore[operator]
         for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-6)
 
@@ -81,4 +81,4 @@ def test_what_is_not_wanted_is_filled() -> None:
 
 
 def test_at_least_one_core_is_there() -> None:
-    assert 1 <= cores() <= os.cpu_count()
+    assert 1 <= cores() <= (os.cpu_count() or 1)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from wlplan.dataset import Dataset
-from wlplan.training import fitting, train
-from wlplan.training.settings import Settings
+from wlplan.training import Settings, fitting, train
 
 
 class KilledError(Exception):
