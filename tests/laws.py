@@ -1,8 +1,12 @@
 """Laws that hold for every stage, as assertions; tests/test_laws.py shows that they can fail."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from wlplan.types import Pile
 
@@ -12,15 +16,21 @@ def volume(pile: Pile) -> jax.Array:
     return jnp.sum(pile.height - pile.floor, axis=(-2, -1)) * pile.cell_size**2
 
 
-def assert_volume_kept(before, after, *, relative=1e-6):
+def assert_volume_kept(before: ArrayLike, after: ArrayLike, *, relative: float = 1e-6) -> None:
     """The summed height is the same to `relative` of the total."""
-    before, after = np.asarray(before, np.float64).sum(), np.asarray(after, np.float64).sum()
-    assert abs(after - before) <= relative * abs(before), (
-        f"the volume changed from {before:.9g} to {after:.9g}"
-    )
+    was, now = (float(np.asarray(height, np.float64).sum()) for height in (before, after))
+    assert abs(now - was) <= relative * abs(was), f"the volume changed from {was:.9g} to {now:.9g}"
 
 
-def assert_gradient(function, point, *, step=1e-6, relative=1e-4, absolute=0.0, skip=None):
+def assert_gradient(
+    function: Callable[[Any], jax.Array],
+    point: Any,
+    *,
+    step: float = 1e-6,
+    relative: float = 1e-4,
+    absolute: float = 0.0,
+    skip: int | None = None,
+) -> int:
     """Reverse mode agrees with central differences, component by component, in float64.
 
     Args:
@@ -39,7 +49,7 @@ def assert_gradient(function, point, *, step=1e-6, relative=1e-4, absolute=0.0, 
     sizes = [leaf.size for leaf in leaves]
     flat = np.concatenate([np.asarray(leaf, np.float64).ravel() for leaf in leaves])
 
-    def value(vector):
+    def value(vector: jax.Array) -> jax.Array:
         parts = np.split(vector, np.cumsum(sizes)[:-1])
         pairs = zip(parts, leaves, strict=True)
         rebuilt = [jnp.asarray(p.reshape(leaf.shape)) for p, leaf in pairs]

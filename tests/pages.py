@@ -6,26 +6,30 @@ from html.parser import HTMLParser
 class Page(HTMLParser):
     """A page whose tags are closed in order: its tags, its words, and what it would load."""
 
-    def __init__(self, source):
+    tags: list[str]
+    links: list[str | None]
+    text: str
+
+    def __init__(self, source: str) -> None:
         super().__init__()
-        self._open = []
+        self._open: list[str] = []
         self.tags, self.links, self.text = [], [], ""
         self.feed(source)
         self.close()
         assert self._open == []
 
-    def handle_starttag(self, tag, attrs):
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Note the tag and what it refers to."""
         self.tags.append(tag)
         self.links += [value for name, value in attrs if name in ("src", "srcset", "href")]
         if tag not in ("meta", "img", "br", "link"):
             self._open.append(tag)
 
-    def handle_endtag(self, tag):
+    def handle_endtag(self, tag: str) -> None:
         """The tag that was opened last is closed first."""
         assert self._open.pop() == tag
 
-    def handle_data(self, data):
+    def handle_data(self, data: str) -> None:
         """Collect words; those of the style sheet are none."""
         if self._open[-1:] != ["style"]:
             self.text += data

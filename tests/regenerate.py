@@ -11,8 +11,10 @@ the bucket with the forces on it until filling ends.
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 PROVENANCE = (
     "Discrete-element loading cycles (LAMMPS, 5,400 to 11,000 spheres, closed loop with the "
@@ -33,7 +35,7 @@ _PHASE, _FILLING = 15, 1
 _ROWS = 420
 
 
-def path_of(record):
+def path_of(record: np.ndarray) -> np.ndarray:
     """The kept columns while the bucket fills, [rows, 7] in SI units, NaN after."""
     record = record[~np.isnan(record[:, 0])]
     filling = record[record[:, _PHASE] <= _FILLING][:, list(PATH.values())]
@@ -42,12 +44,12 @@ def path_of(record):
     return path
 
 
-def small(heights):
+def small(heights: Any) -> np.ndarray:
     """Heights in whole millimetres."""
     return np.round(1000.0 * np.asarray(heights)).astype(np.int16)
 
 
-def fitted(path):
+def fitted(path: Path) -> dict[str, np.ndarray]:
     """Fields of the cycles of calibration.npz."""
     with np.load(path) as calibration:
         return {
@@ -65,11 +67,11 @@ def fitted(path):
         }
 
 
-def held_out(folder):
+def held_out(folder: Path) -> dict[str, np.ndarray]:
     """Fields of cycles that lie in files of their own."""
     cycles = [np.load(path) for path in sorted(folder.glob("*.npz"))]
 
-    def joined(name, dtype=np.float32):
+    def joined(name: str, dtype: npt.DTypeLike = np.float32) -> np.ndarray:
         return np.stack([cycle[name] for cycle in cycles]).astype(dtype)
 
     return {
@@ -88,7 +90,7 @@ def held_out(folder):
     }
 
 
-def main(path):
+def main(path: Path) -> None:
     """Writes the reference that a path is the source of."""
     name, fields = (
         ("dem_held_out", held_out(path)) if path.is_dir() else ("dem_cycles", fitted(path))
@@ -97,7 +99,8 @@ def main(path):
     fields["path"] = fields["path"][:, :longest]
     target = Path(__file__).parent / "references" / f"{name}.npz"
     target.parent.mkdir(exist_ok=True)
-    np.savez_compressed(target, path_names=np.array(list(PATH)), **fields)
+    named: dict[str, Any] = {"path_names": np.array(list(PATH)), **fields}
+    np.savez_compressed(target, **named)
     print(f"{target}: {len(fields['mass_t'])} cycles, {target.stat().st_size / 1024:.0f} KiB")
 
 

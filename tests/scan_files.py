@@ -1,20 +1,24 @@
 """Pile files that the tests write, and the refusal of one."""
 
 import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from wlplan import io
 from wlplan.errors import InputError
+from wlplan.types import Pile
 
 
-def save(path, fields):
+def save(path: Path, fields: Mapping[str, Any]) -> Path:
     np.savez(path, **fields)
     return path
 
 
-def refused(path, match, **arguments):
+def refused(path: Path, match: str, **arguments: Any) -> str:
     """Check that reading a pile fails with one line that names the file."""
     with pytest.raises(InputError, match=match) as error:
         io.read_pile(path, **arguments)
@@ -23,14 +27,22 @@ def refused(path, match, **arguments):
     return str(error.value)
 
 
-def points_of(pile, random, n=60_000):
+def points_of(pile: Pile, random: np.random.Generator, n: int = 60_000) -> np.ndarray:
     """A point cloud of a pile: random places, bilinear would be overkill for what is tested."""
     i, j = (random.integers(0, size, n) for size in pile.height.shape)
     x, y = (np.asarray(pile.origin)[axis] + 0.1 * k for axis, k in ((0, i), (1, j)))
     return np.stack([x, y, np.asarray(pile.height)[i, j]], axis=-1).astype(np.float64)
 
 
-def write_tif(path, band, *, step=0.1, west=100.0, north=200.0, **options):
+def write_tif(
+    path: Path,
+    band: np.ndarray,
+    *,
+    step: float = 0.1,
+    west: float = 100.0,
+    north: float = 200.0,
+    **options: Any,
+) -> Path:
     rasterio = pytest.importorskip("rasterio")
     transform = options.pop("transform", rasterio.Affine(step, 0.0, west, 0.0, -step, north))
     profile = {
@@ -45,7 +57,7 @@ def write_tif(path, band, *, step=0.1, west=100.0, north=200.0, **options):
     return path
 
 
-def write_las(path, points):
+def write_las(path: Path, points: np.ndarray) -> Path:
     laspy = pytest.importorskip("laspy")
     if path.suffix == ".laz":
         pytest.importorskip("lazrs")
@@ -56,7 +68,9 @@ def write_las(path, points):
     return path
 
 
-def write_ply(path, points, encoding="binary_little_endian", extra=""):
+def write_ply(
+    path: Path, points: np.ndarray, encoding: str = "binary_little_endian", extra: str = ""
+) -> Path:
     order = ">" if encoding.endswith("big_endian") else "<"
     head = (
         f"ply\nformat {encoding} 1.0\ncomment a scan\nelement vertex {len(points)}\n"

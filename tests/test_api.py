@@ -7,6 +7,7 @@ its own, which does not.
 import json
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
@@ -122,7 +123,7 @@ print(json.dumps(found))
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory):
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     done = subprocess.run(
         [sys.executable, "-c", _MISUSE],
         capture_output=True,
@@ -132,7 +133,8 @@ def found(tmp_path_factory):
         cwd=tmp_path_factory.mktemp("elsewhere"),
     )
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return told
 
 
 @pytest.mark.parametrize(
@@ -164,23 +166,25 @@ def found(tmp_path_factory):
         ("nan cost", "finite cost"),
     ],
 )
-def test_a_mistake_is_one_clear_line(found, case, words):
+def test_a_mistake_is_one_clear_line(found: dict[str, Any], case: str, words: str) -> None:
     assert words in found[case]
     assert "\n" not in found[case]
     assert not found[case].split(" ")[0].endswith("Error:")
 
 
-def test_numpy_lists_and_numbers_are_taken_wherever_arrays_are(found):
+def test_numpy_lists_and_numbers_are_taken_wherever_arrays_are(found: dict[str, Any]) -> None:
     assert found["costs"][0] == found["list pile"] > 0.0
     assert found["costs"] == pytest.approx([found["costs"][0]] * 3, rel=1e-6)
     assert found["numbers"] == 12.0
 
 
-def test_a_world_that_says_it_has_no_derivative_is_planned_in_by_trial(found):
+def test_a_world_that_says_it_has_no_derivative_is_planned_in_by_trial(
+    found: dict[str, Any],
+) -> None:
     assert found["by trial"] > 0.0
 
 
-def test_nothing_is_compiled_a_second_time(found):
+def test_nothing_is_compiled_a_second_time(found: dict[str, Any]) -> None:
     assert found["compiled again"] == dict.fromkeys(
         ("rollout", "grad", "play", "world", "relax"), 0
     )

@@ -1,6 +1,9 @@
 """The avalanche automaton: laws, then values, then gradients."""
 
+import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +12,7 @@ import pytest
 from laws import assert_gradient, assert_volume_kept
 
 from wlplan.site.machine import WA320
-from wlplan.studies.bench.digs import random_digs
+from wlplan.studies.bench.digs import Dig, random_digs
 from wlplan.terrain.automaton import (
     FLOW_FRACTION,
     Schedule,
@@ -31,14 +34,14 @@ REPOSE = math.radians(32.0)
 DROP = 0.1 * math.tan(REPOSE)
 
 
-def rough(seed=0, shape=(48, 40), amplitude=0.3):
+def rough(seed: int = 0, shape: tuple[int, int] = (48, 40), amplitude: float = 0.3) -> jax.Array:
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
     cone = np.maximum(1.5 - 0.08 * np.hypot(x - shape[0] / 2, y - shape[1] / 2), 0.0)
     return jnp.asarray(cone + amplitude * rng.random(shape), jnp.float32)
 
 
-def dug_cone(shape=(96, 96)):
+def dug_cone(shape: tuple[int, int] = (96, 96)) -> jax.Array:
     """A 31 degree cone with a bucket-sized hole in its side."""
     x, y = np.meshgrid(0.1 * np.arange(shape[0]), 0.1 * np.arange(shape[1]), indexing="ij")
     slope = math.tan(math.radians(31.0))
@@ -48,13 +51,13 @@ def dug_cone(shape=(96, 96)):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_sweeps_and_settling_keep_the_volume(seed):
+def test_sweeps_and_settling_keep_the_volume(seed: int) -> None:
     height = rough(seed)
     assert_volume_kept(height, sweeps(height, DROP, None, 100))
     assert_volume_kept(height, settle(Pile(height, 0.1)).pile.height)
 
 
-def test_a_sweep_moves_one_edge_by_hand():
+def test_a_sweep_moves_one_edge_by_hand() -> None:
     height = jnp.asarray([[1.0, 0.0]])
     flow = FLOW_FRACTION * (1.0 - DROP)
     # The mirrored border repeats the pair at its diagonals.
@@ -63,7 +66,7 @@ def test_a_sweep_moves_one_edge_by_hand():
     np.testing.assert_allclose(sweep(height, DROP), [[1.0 - moved, moved]], rtol=1e-6)
 
 
-def test_a_settled_pile_stays_settled():
+def test_a_settled_pile_stays_settled() -> None:
     x, y = np.meshgrid(np.arange(48), np.arange(40), indexing="ij")
     noise = 0.01 * np.random.default_rng(0).random((48, 40))
     gentle = jnp.asarray(np.maximum(1.0 - 0.04 * np.hypot(x - 24, y - 20), 0.0) + noise)
@@ -74,21 +77,21 @@ def test_a_settled_pile_stays_settled():
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
-def test_rotating_commutes_with_settling(turns):
+def test_rotating_commutes_with_settling(turns: int) -> None:
     height = rough(shape=(48, 48))
     straight = settle(Pile(height, 0.1)).pile.height
     turned = settle(Pile(jnp.rot90(height, turns), 0.1)).pile.height
     np.testing.assert_allclose(jnp.rot90(straight, turns), turned, atol=1e-6)
 
 
-def test_reflecting_commutes_with_settling():
+def test_reflecting_commutes_with_settling() -> None:
     height = rough(shape=(48, 48))
     straight = settle(Pile(height, 0.1)).pile.height
     reflected = settle(Pile(height[:, ::-1], 0.1)).pile.height
     np.testing.assert_allclose(straight[:, ::-1], reflected, atol=1e-6)
 
 
-def test_a_sweep_is_not_expansive():
+def test_a_sweep_is_not_expansive() -> None:
     """Non-expansive in the 1-norm and the 2-norm, as a symmetric stochastic Jacobian must be."""
     rng = np.random.default_rng(0)
     for seed in range(10):
@@ -100,16 +103,16 @@ def test_a_sweep_is_not_expansive():
             assert after <= before * (1 + 1e-6)
 
 
-def test_a_sweep_is_monotone():
+def test_a_sweep_is_monotone() -> None:
     a = rough(1, amplitude=1.0)
     b = a + jnp.asarray(np.random.default_rng(0).random(a.shape) * 0.3, a.dtype)
     assert (sweep(b, DROP) - sweep(a, DROP)).min() >= -1e-6
 
 
-def test_a_batch_equals_its_members():
+def test_a_batch_equals_its_members() -> None:
     heights = jnp.stack([rough(seed) for seed in range(3)])
 
-    def run(height):
+    def run(height: jax.Array) -> jax.Array:
         return settle(Pile(height, 0.1)).pile.height
 
     np.testing.assert_allclose(jax.vmap(run)(heights), [run(h) for h in heights], atol=2e-6)
@@ -118,7 +121,7 @@ def test_a_batch_equals_its_members():
     np.testing.assert_allclose(jax.vmap(gradient)(heights), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_the_reference_comes_to_rest_at_the_angle_of_repose():
+def test_the_reference_comes_to_rest_at_the_angle_of_repose() -> None:
     # In float32 ten thousand sweeps round the volume off by some 1e-5.
     with jax.enable_x64(True):
         dug = jnp.asarray(dug_cone(), jnp.float64)
@@ -128,18 +131,18 @@ def test_the_reference_comes_to_rest_at_the_angle_of_repose():
 
 
 @pytest.fixture(scope="module")
-def digs():
+def digs() -> list[Dig]:
     """A hundred random digs on all seed piles, each pile as the digs before left it."""
     return random_digs(100, seed=0)
 
 
-def test_after_a_load_no_slope_anywhere_is_more_than_a_degree_too_steep(digs):
+def test_after_a_load_no_slope_anywhere_is_more_than_a_degree_too_steep(digs: list[Dig]) -> None:
     """Of the whole pile, not only of the window, load after load."""
     steepest = [math.degrees(steepest_slope(dig.after)) for dig in digs]
     assert max(steepest) <= 33.0 + 1e-3
 
 
-def test_a_load_leaves_the_volume_and_the_ground(digs):
+def test_a_load_leaves_the_volume_and_the_ground(digs: list[Dig]) -> None:
     settled = jax.jit(settle)
     for dig in digs[::5]:
         assert_volume_kept(dig.dug.height, settled(dig.dug).pile.height)
@@ -149,7 +152,7 @@ def test_a_load_leaves_the_volume_and_the_ground(digs):
         assert dig.dug.height.sum() < dig.before.height.sum()
 
 
-def test_settling_a_dig_is_close_to_the_converged_automaton(digs):
+def test_settling_a_dig_is_close_to_the_converged_automaton(digs: list[Dig]) -> None:
     """Within 2 cm on average over the disturbed area."""
     settled, reference = jax.jit(settle), jax.jit(converged)
     for dig in digs[:: 100 // 12]:
@@ -159,7 +162,7 @@ def test_settling_a_dig_is_close_to_the_converged_automaton(digs):
         assert jnp.abs(fast - slow)[disturbed].mean() <= 0.02
 
 
-def test_an_avalanche_that_leaves_the_window_goes_on_beyond():
+def test_an_avalanche_that_leaves_the_window_goes_on_beyond() -> None:
     """A slope at the angle of repose that is longer than the window, undercut at its foot."""
     x = 0.1 * np.arange(160)
     height = np.broadcast_to(math.tan(math.radians(31.9)) * x[:, None], (160, 120))
@@ -176,14 +179,14 @@ def test_an_avalanche_that_leaves_the_window_goes_on_beyond():
     assert_volume_kept(jax.lax.dynamic_update_slice(pile.height, dug.height, start), after.height)
 
 
-def test_a_tighter_tolerance_is_met():
+def test_a_tighter_tolerance_is_met() -> None:
     for degrees in (0.2, 0.5, 3.0):
         schedule = Schedule(tolerance=math.radians(degrees), most_rounds=50)
         settled = settle(Pile(dug_cone(), 0.1), schedule=schedule).pile
         assert math.degrees(steepest_slope(settled)) <= 32.0 + degrees + 1e-3
 
 
-def test_relax_reaches_its_tolerance_on_a_cliff():
+def test_relax_reaches_its_tolerance_on_a_cliff() -> None:
     height = jnp.zeros((101, 83)).at[20:60, 20:60].set(4.0)
     relaxed = relax(Pile(height, 0.1))
     assert math.degrees(steepest_slope(relaxed)) <= 33.0 + 1e-3
@@ -191,7 +194,7 @@ def test_relax_reaches_its_tolerance_on_a_cliff():
     assert relaxed.height.min() >= 0.0
 
 
-def test_nothing_slides_below_an_uneven_floor_or_into_unseen_cells():
+def test_nothing_slides_below_an_uneven_floor_or_into_unseen_cells() -> None:
     x, y = np.meshgrid(np.arange(64), np.arange(64), indexing="ij")
     # A hollow with walls at 20 degrees, and a step that no soil could stand on.
     ground = 0.1 * math.tan(math.radians(20.0)) * np.hypot(x - 32, y - 32) + 1.0 * (x > 50)
@@ -206,29 +209,31 @@ def test_nothing_slides_below_an_uneven_floor_or_into_unseen_cells():
     )
     relaxed = relax(pile)
     assert_volume_kept(pile.height, relaxed.height)
+    assert pile.ground is not None
     assert (relaxed.height - pile.ground).min() >= -1e-5
     np.testing.assert_array_equal(relaxed.height[:, :6], pile.height[:, :6])
     active = movable(pile, REPOSE)
     assert math.degrees(steepest_slope(relaxed.replace(valid=active))) <= 33.0 + 1e-3
 
 
-def test_any_size_of_grid_can_be_settled():
+def test_any_size_of_grid_can_be_settled() -> None:
     pile = Pile(rough(shape=(47, 41)), 0.1)
     settled = settle(pile).pile
     assert settled.height.shape == (47, 41)
     assert_volume_kept(pile.height, settled.height)
 
 
-def test_padding_takes_no_part():
+def test_padding_takes_no_part() -> None:
     pile = Pile(rough(shape=(41, 42)), 0.1)
     padded = pad_pile(pile, 4)
     assert padded.height.shape == (44, 44)
+    assert padded.valid is not None
     assert not padded.valid[41:].any()
     assert not padded.valid[:, 42:].any()
     assert padded.valid[:41, :42].all()
 
 
-def test_the_window_stays_inside_the_grid_and_holds_the_dig():
+def test_the_window_stays_inside_the_grid_and_holds_the_dig() -> None:
     pile = Pile(jnp.zeros((150, 120)), 0.1, (-5.0, 2.0))
     for x, y in ((-5.0, 2.0), (2.0, 8.0), (9.8, 13.8)):
         window, (i, j) = window_of(pile, Pose(*map(jnp.float32, (x, y, 0.3))))
@@ -238,7 +243,7 @@ def test_the_window_stays_inside_the_grid_and_holds_the_dig():
         np.testing.assert_allclose(window.origin, [-5.0 + 0.1 * i, 2.0 + 0.1 * j], atol=1e-5)
 
 
-def test_gradient_of_sweeps_against_finite_differences():
+def test_gradient_of_sweeps_against_finite_differences() -> None:
     with jax.enable_x64(True):
         height = jnp.asarray(np.asarray(rough(shape=(10, 9))), jnp.float64)
         weight = jnp.asarray(np.random.default_rng(0).normal(size=height.shape))
@@ -246,7 +251,7 @@ def test_gradient_of_sweeps_against_finite_differences():
 
 
 @pytest.mark.parametrize("count", [70, 300])
-def test_gradient_of_more_sweeps_than_are_kept(count):
+def test_gradient_of_more_sweeps_than_are_kept(count: int) -> None:
     with jax.enable_x64(True):
         height = jnp.asarray(np.asarray(rough(4, shape=(6, 5))), jnp.float64)
         weight = jnp.asarray(np.random.default_rng(0).normal(size=height.shape))
@@ -255,7 +260,7 @@ def test_gradient_of_more_sweeps_than_are_kept(count):
         )
 
 
-def uneven(rng, shape=(14, 11)):
+def uneven(rng: np.random.Generator, shape: tuple[int, int] = (14, 11)) -> Pile:
     """Noise on a sloping floor, some cells unseen, sides that are no multiple of 4."""
     height = np.asarray(rough(2, shape=shape), np.float64)
     ground = 0.03 * np.arange(shape[0])[:, None] + 0.01 * rng.random(shape)
@@ -267,20 +272,20 @@ def uneven(rng, shape=(14, 11)):
     )
 
 
-def test_gradient_of_settling_against_finite_differences_with_mask_and_floor():
+def test_gradient_of_settling_against_finite_differences_with_mask_and_floor() -> None:
     with jax.enable_x64(True):
         rng = np.random.default_rng(1)
         pile = uneven(rng)
         weight = jnp.asarray(rng.normal(size=pile.height.shape))
 
-        def cost(h):
+        def cost(h: jax.Array) -> jax.Array:
             return (weight * settle(pile.replace(height=h), repose_angle=REPOSE).pile.height).sum()
 
         assert jnp.abs(settle(pile).pile.height - pile.height).max() > 0.1
         assert_gradient(cost, pile.height, relative=1e-5, skip=8)
 
 
-def test_gradient_through_several_windows_against_finite_differences():
+def test_gradient_through_several_windows_against_finite_differences() -> None:
     """A small window on a long slope, so that the avalanche needs more than one."""
     with jax.enable_x64(True):
         rng = np.random.default_rng(3)
@@ -291,7 +296,7 @@ def test_gradient_through_several_windows_against_finite_differences():
         dug = jax.lax.dynamic_slice(pile.height, start, (8, 8)).at[1:4, 2:6].add(-0.3)
         weight = jnp.asarray(rng.normal(size=height.shape))
 
-        def cost(h):
+        def cost(h: jax.Array) -> jax.Array:
             return (weight * settle_dug(pile, h, start).pile.height).sum()
 
         moved = settle_dug(pile, dug, start).pile.height != pile.height
@@ -299,34 +304,34 @@ def test_gradient_through_several_windows_against_finite_differences():
         assert_gradient(cost, dug, relative=1e-5, skip=8)
 
 
-def test_cells_outside_the_avalanche_keep_their_cotangent():
+def test_cells_outside_the_avalanche_keep_their_cotangent() -> None:
     pile = uneven(np.random.default_rng(5), shape=(24, 22))
     gradient = jax.grad(lambda h: settle(pile.replace(height=h)).pile.height.sum())(pile.height)
     # The volume is kept, whatever slides.
     np.testing.assert_allclose(gradient, 1.0, atol=1e-5)
 
 
-def test_forward_mode_says_that_it_is_not_available():
+def test_forward_mode_says_that_it_is_not_available() -> None:
     height = rough(shape=(8, 8))
     with pytest.raises(TypeError, match="forward-mode"):
         jax.jvp(lambda h: settle(Pile(h, 0.1)).pile.height, (height,), (jnp.ones_like(height),))
 
 
-def test_memory_of_the_gradient_does_not_grow_with_the_sweeps():
+def test_memory_of_the_gradient_does_not_grow_with_the_sweeps() -> None:
     height = rough(shape=(64, 64))
 
-    def peak(function):
+    def peak(function: Callable[[jax.Array], jax.Array]) -> Any:
         return jax.jit(jax.grad(function)).lower(height).compile().memory_analysis()
 
-    sizes = [
-        peak(lambda h, n=count: (sweeps(h, DROP, None, n) ** 2).sum()).temp_size_in_bytes
-        for count in (256, 4096)
-    ]
+    def cost(count: int, h: jax.Array) -> jax.Array:
+        return (sweeps(h, DROP, None, count) ** 2).sum()
+
+    sizes = [peak(functools.partial(cost, count)).temp_size_in_bytes for count in (256, 4096)]
     assert sizes[1] <= 1.5 * sizes[0] + 64 * height.nbytes
     assert sizes[1] <= 200 * height.nbytes
 
 
-def test_gradient_stays_bounded_over_many_sweeps():
+def test_gradient_stays_bounded_over_many_sweeps() -> None:
     """Unit row sums and symmetry: the cotangent never grows in the largest component."""
     height = rough(3, amplitude=1.0)
     weight = jnp.asarray(np.random.default_rng(0).normal(size=height.shape), height.dtype)
@@ -335,7 +340,7 @@ def test_gradient_stays_bounded_over_many_sweeps():
         assert jnp.abs(gradient).max() <= jnp.abs(weight).max() * (1 + 1e-5)
 
 
-def test_gradient_is_finite_on_flat_ground():
+def test_gradient_is_finite_on_flat_ground() -> None:
     for height in (jnp.zeros((16, 16)), jnp.full((16, 16), 2.0)):
         gradient = jax.grad(lambda h: (settle(Pile(h, 0.1)).pile.height ** 2).sum())(height)
         assert jnp.isfinite(gradient).all()

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.typing import ArrayLike, DTypeLike
 from laws import assert_gradient
 
 from wlplan.terrain.characteristics import as_vector, characteristics
@@ -13,17 +14,17 @@ from wlplan.terrain.heightmap import local_axes
 from wlplan.types import LocalHeightmap
 
 
-def local(height, dtype=jnp.float32):
+def local(height: ArrayLike, dtype: DTypeLike = jnp.float32) -> LocalHeightmap:
     return LocalHeightmap(jnp.asarray(height, dtype), 0.1, 0.0)
 
 
-def grid(cells=36):
+def grid(cells: int = 36) -> tuple[np.ndarray, ...]:
     return np.meshgrid(*local_axes(cells, 0.0), indexing="ij")
 
 
 @pytest.mark.parametrize("slope", [10.0, 20.0, 30.0])
 @pytest.mark.parametrize("incidence", [-25.0, 0.0, 10.0, 40.0, 100.0])
-def test_a_plane(slope, incidence):
+def test_a_plane(slope: float, incidence: float) -> None:
     x, y = grid()
     a = math.radians(incidence)
     height = math.tan(math.radians(slope)) * (math.cos(a) * x + math.sin(a) * y)
@@ -35,7 +36,7 @@ def test_a_plane(slope, incidence):
 
 
 @pytest.mark.parametrize(("kx", "ky"), [(0.2, 0.0), (0.0, -0.3), (-0.1, 0.25)])
-def test_a_paraboloid_has_its_curvatures_and_convex_is_positive(kx, ky):
+def test_a_paraboloid_has_its_curvatures_and_convex_is_positive(kx: float, ky: float) -> None:
     x, y = grid()
     height = 0.5 * x - 0.5 * kx * x**2 - 0.5 * ky * y**2
     c = characteristics(local(height))
@@ -43,7 +44,7 @@ def test_a_paraboloid_has_its_curvatures_and_convex_is_positive(kx, ky):
     assert float(c.curvature_y) == pytest.approx(ky, abs=1e-4)
 
 
-def test_a_constant_offset_changes_nothing_and_a_reflection_neither():
+def test_a_constant_offset_changes_nothing_and_a_reflection_neither() -> None:
     rng = np.random.default_rng(0)
     x, y = grid()
     height = 0.5 * x + 0.1 * y + 0.1 * rng.random(x.shape)
@@ -54,7 +55,7 @@ def test_a_constant_offset_changes_nothing_and_a_reflection_neither():
     )
 
 
-def test_the_gradient_agrees_with_finite_differences():
+def test_the_gradient_agrees_with_finite_differences() -> None:
     with jax.enable_x64(True):
         rng = np.random.default_rng(0)
         x, y = grid(8)
@@ -67,7 +68,7 @@ def test_the_gradient_agrees_with_finite_differences():
 
 
 @pytest.mark.parametrize("height", [np.zeros((36, 36)), np.full((36, 36), 1.5), 0.5 * grid()[0]])
-def test_flat_and_head_on_ground_have_finite_values_and_gradients(height):
+def test_flat_and_head_on_ground_have_finite_values_and_gradients(height: np.ndarray) -> None:
     jacobian = jax.jacrev(lambda h: as_vector(characteristics(local(h))))(
         jnp.asarray(height, jnp.float32)
     )

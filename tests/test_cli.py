@@ -7,6 +7,9 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,12 +25,15 @@ from wlplan.planning.job import PlanResult
 from wlplan.planning.loading import Transport
 from wlplan.report import figures as plots
 from wlplan.report import page as report
-from wlplan.site.machine import WA320
-from wlplan.site.soil import GRAVEL, SAND
+from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.soil import GRAVEL, SAND, Soil
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
-from wlplan.types import Action, LoadingPlan, Performance, Pose, Rollout
+from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose, Rollout
 from wlplan.worlds import library as worlds
+
+# Exit code, stdout and stderr of words of the command line.
+Run = Callable[..., tuple[int, str, str]]
 
 FILES = ["plan.json", "plan.png", "report.html", "totals.png"]
 
@@ -35,17 +41,17 @@ FILES = ["plan.json", "plan.png", "report.html", "totals.png"]
 class FakeWorld:
     """A world of simple numbers; `fake_play` says what a whole plan does in it."""
 
-    def __init__(self, factor, soil=GRAVEL):
+    def __init__(self, factor: float, soil: Soil = GRAVEL) -> None:
         self.factor, self.soil = factor, soil
 
-    def __call__(self, pile, pose, action):
+    def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         """The pile as it was."""
         mass = 2.0 * self.factor + 0.0 * pose.x
         performance = Performance(mass, 10.0 + action.k_bm, 300.0 + pose.x)
         return pile, performance
 
 
-def fake_play(world, pile, plan, **_):
+def fake_play(world: FakeWorld, pile: Pile, plan: LoadingPlan, **_: object) -> PlanResult:
     count = len(plan.pose.x)
     mass = jnp.asarray(world.factor * np.linspace(1.0, 3.0, count), jnp.float32)
     height = np.asarray(pile.height, np.float64)
@@ -63,27 +69,34 @@ def fake_play(world, pile, plan, **_):
 
 
 @pytest.fixture
-def calls():
+def calls() -> list[dict[str, Any]]:
     """Arguments of the calls of the planner, in order."""
     return []
 
 
 @pytest.fixture
-def asked():
+def asked() -> list[tuple[str, Soil, WheelLoader]]:
     """Worlds that were asked for: name, soil, machine."""
     return []
 
 
 @pytest.fixture
-def real_figures():
+def real_figures() -> None:
     """Asked for by the tests that want them."""
 
 
 @pytest.fixture(autouse=True)
-def fakes(monkeypatch, calls, asked, request):
+def fakes(
+    monkeypatch: pytest.MonkeyPatch,
+    calls: list[dict[str, Any]],
+    asked: list[tuple[str, Soil, WheelLoader]],
+    request: pytest.FixtureRequest,
+) -> None:
     """Stand-ins for what takes long; the pile and the files are real."""
 
-    def plan_loads(world, pile, *, loads, progress, **options):
+    def plan_loads(
+        world: FakeWorld, pile: Pile, *, loads: int, progress: Callable[..., None], **options: Any
+    ) -> PlanResult:
         calls.append({"loads": loads, **options})
         pose = edge_poses(toe_contour(pile), loads)
         plan = LoadingPlan(
@@ -94,7 +107,14 @@ def fakes(monkeypatch, calls, asked, request):
             progress("steps", done + 1, loads, 3.0)
         return fake_play(world, pile, plan)
 
-    def load_world(name, *, model=None, pile_state=None, soil=GRAVEL, machine=WA320):
+    def load_world(
+        name: str,
+        *,
+        model: str | None = None,
+        pile_state: str | None = None,
+        soil: Soil = GRAVEL,
+        machine: WheelLoader = WA320,
+    ) -> FakeWorld:
         asked.append((name, soil, machine))
         if name in ("high", "low"):
             raise InputError(f"the {name} world\nis not there yet; use hybrid")
@@ -109,7 +129,7 @@ def fakes(monkeypatch, calls, asked, request):
 
 
 @pytest.fixture
-def scan(tmp_path):
+def scan(tmp_path: Path) -> str:
     """A pile file."""
     path = tmp_path / "scan.npz"
     io.write_pile(path, seed_pile("conical", slope=math.radians(30.0), height=2.0, seed=1))
@@ -117,10 +137,10 @@ def scan(tmp_path):
 
 
 @pytest.fixture
-def run(capsys):
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
     """Run the command line; returns exit code, stdout and stderr."""
 
-    def run_words(*words):
+    def run_words(*words: object) -> tuple[int, str, str]:
         capsys.readouterr()
         code = cli.main([str(word) for word in words])
         return code, *capsys.readouterr()
@@ -128,7 +148,7 @@ def run(capsys):
     return run_words
 
 
-def refused(result, *words):
+def refused(result: tuple[int, str, str], *words: str) -> str:
     code, out, err = result
     assert code == 2
     assert out == ""
@@ -140,17 +160,20 @@ def refused(result, *words):
     return err
 
 
-def strict_json(text):
-    def fail(constant):
+def strict_json(text: str) -> dict[str, Any]:
+    def fail(constant: str) -> NoReturn:
         raise AssertionError(f"{constant} in JSON")
 
-    return json.loads(text, parse_constant=fail)
+    document: dict[str, Any] = json.loads(text, parse_constant=fail)
+    return document
 
 
 # --- plan
 
 
-def test_a_plan_is_written_with_figures_and_report(run, scan, tmp_path, real_figures):
+def test_a_plan_is_written_with_figures_and_report(
+    run: Run, scan: str, tmp_path: Path, real_figures: None
+) -> None:
     code, out, err = run("plan", scan, "--loads", 3, "--out", tmp_path / "out")
     assert code == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
@@ -165,14 +188,14 @@ def test_a_plan_is_written_with_figures_and_report(run, scan, tmp_path, real_fig
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
 
 
-def test_json_on_stdout_is_plan_json_and_nothing_else(run, scan, tmp_path):
+def test_json_on_stdout_is_plan_json_and_nothing_else(run: Run, scan: str, tmp_path: Path) -> None:
     code, out, err = run("plan", scan, "--loads", 2, "--json", "--out", tmp_path / "out")
     assert code == 0
     assert out == (tmp_path / "out" / "plan.json").read_text()
     assert "steps" in err
 
 
-def test_plan_json_holds_what_the_contract_says(run, scan):
+def test_plan_json_holds_what_the_contract_says(run: Run, scan: str) -> None:
     code, out, _ = run("plan", scan, "--loads", 3, "--seed", 5, "--truck", "-12,1,30", "--json")
     document = strict_json(out)
     assert code == 0
@@ -202,7 +225,7 @@ def test_plan_json_holds_what_the_contract_says(run, scan):
     assert ledger["mass_removed"] == pytest.approx(document["total"]["simulated"]["mass"])
 
 
-def test_the_options_reach_the_planner(run, scan, calls):
+def test_the_options_reach_the_planner(run: Run, scan: str, calls: list[dict[str, Any]]) -> None:
     options = ("--loads", 2, "--planner", "greedy", "--objective", "energy", "--seed", 7)
     run("plan", scan, *options, "--truck", "-10,0")
     (call,) = calls
@@ -214,19 +237,19 @@ def test_the_options_reach_the_planner(run, scan, calls):
     assert math.cos(float(receiver.heading)) < 0.9
 
 
-def test_without_a_pile_the_bundled_one_is_planned(run):
+def test_without_a_pile_the_bundled_one_is_planned(run: Run) -> None:
     code, out, _ = run("plan", "--loads", 1, "--json")
     assert code == 0
     assert "bundled" in json.loads(out)["pile"]["file"]
 
 
-def test_a_plan_in_the_simulator_predicts_what_is_simulated(run, scan):
+def test_a_plan_in_the_simulator_predicts_what_is_simulated(run: Run, scan: str) -> None:
     _, out, _ = run("plan", scan, "--loads", 2, "--world", "simulator", "--json")
     for load in json.loads(out)["loads"]:
         assert load["predicted"] == load["simulated"]
 
 
-def test_other_files_in_the_folder_stay(run, scan, tmp_path):
+def test_other_files_in_the_folder_stay(run: Run, scan: str, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     folder.mkdir()
     (folder / "notes.txt").write_text("mine")
@@ -242,14 +265,20 @@ def test_other_files_in_the_folder_stay(run, scan, tmp_path):
     ("stop", "code"), [(KeyboardInterrupt(), 130), (OSError(28, "No space left on device"), 2)]
 )
 def test_a_run_that_is_cut_short_leaves_nothing(
-    run, scan, tmp_path, monkeypatch, exists, stop, code
-):
+    run: Run,
+    scan: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    exists: bool,
+    stop: BaseException,
+    code: int,
+) -> None:
     folder = tmp_path / "out"
     if exists:
         folder.mkdir()
         (folder / "plan.json").write_text("old")
 
-    def write_report(*_, **__):
+    def write_report(*_: object, **__: object) -> None:
         raise stop
 
     monkeypatch.setattr(report, "write_report", write_report)
@@ -265,8 +294,10 @@ def test_a_run_that_is_cut_short_leaves_nothing(
         assert sorted(path.name for path in tmp_path.iterdir()) == ["scan.npz"]
 
 
-def test_numbers_that_are_not_finite_are_refused(run, scan, tmp_path, monkeypatch):
-    def broken(*arguments, **options):
+def test_numbers_that_are_not_finite_are_refused(
+    run: Run, scan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*arguments: Any, **options: Any) -> PlanResult:
         result = fake_play(*arguments, **options)
         return result.replace(cost=jnp.asarray(jnp.nan))
 
@@ -278,8 +309,10 @@ def test_numbers_that_are_not_finite_are_refused(run, scan, tmp_path, monkeypatc
     assert not (tmp_path / "out").exists()
 
 
-def test_a_ledger_that_does_not_close_is_told(run, scan, tmp_path, monkeypatch):
-    def leaky(world, pile, plan, **options):
+def test_a_ledger_that_does_not_close_is_told(
+    run: Run, scan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def leaky(world: FakeWorld, pile: Pile, plan: LoadingPlan, **options: Any) -> PlanResult:
         result = fake_play(world, pile, plan, **options)
         return result.replace(rollout=Rollout(result.rollout.performance, pile))
 
@@ -290,8 +323,10 @@ def test_a_ledger_that_does_not_close_is_told(run, scan, tmp_path, monkeypatch):
     assert "does not close" in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_a_fault_of_ours_is_one_line_too(run, scan, monkeypatch):
-    def plan_loads(*_, **__):
+def test_a_fault_of_ours_is_one_line_too(
+    run: Run, scan: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def plan_loads(*_: object, **__: object) -> None:
         raise ZeroDivisionError("what\nelse")
 
     monkeypatch.setattr(planner, "plan_loads", plan_loads)
@@ -304,7 +339,7 @@ def test_a_fault_of_ours_is_one_line_too(run, scan, monkeypatch):
 # --- simulate
 
 
-def test_a_written_plan_is_played_again(run, scan, tmp_path):
+def test_a_written_plan_is_played_again(run: Run, scan: str, tmp_path: Path) -> None:
     run("plan", scan, "--loads", 3, "--truck", "-12,1,30", "--out", tmp_path / "out")
     path = tmp_path / "out" / "plan.json"
     code, out, _ = run("simulate", scan, path)
@@ -322,7 +357,7 @@ def test_a_written_plan_is_played_again(run, scan, tmp_path):
             assert one[part] == pytest.approx(two[part])
 
 
-def test_a_bare_plan_is_played_too(run, scan, tmp_path):
+def test_a_bare_plan_is_played_too(run: Run, scan: str, tmp_path: Path) -> None:
     action = {"delta_bm": 0.5, "k_bm": 2, "delta_bk": 0.5, "k_bk": 2}
     load = {"x": 3.0, "y": 0.0, "heading": 3.1, "action": action}
     path = tmp_path / "plan.json"
@@ -335,14 +370,14 @@ def test_a_bare_plan_is_played_too(run, scan, tmp_path):
     assert document["total"]["simulated"]["mass"] > 0.0
 
 
-def test_a_plan_for_another_pile_is_told(run, scan, tmp_path):
+def test_a_plan_for_another_pile_is_told(run: Run, scan: str, tmp_path: Path) -> None:
     run("plan", "--loads", 1, "--out", tmp_path / "out")
     code, _, err = run("simulate", scan, tmp_path / "out" / "plan.json")
     assert code == 0
     assert "another pile" in err
 
 
-def test_a_plan_that_is_none_is_refused(run, scan, tmp_path):
+def test_a_plan_that_is_none_is_refused(run: Run, scan: str, tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
     path.write_text("{}")
     refused(run("simulate", scan, path), str(path))
@@ -353,7 +388,9 @@ def test_a_plan_that_is_none_is_refused(run, scan, tmp_path):
 # --- diggability
 
 
-def test_a_map_is_written(run, scan, tmp_path, monkeypatch, real_figures):
+def test_a_map_is_written(
+    run: Run, scan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_figures: None
+) -> None:
     monkeypatch.setattr(worlds, "load_world", lambda name, **_: FakeWorld(1.0).__call__)
     words = ("diggability", scan, "--locations", 20, "--action", "0.1,2,0.3,4")
     code, out, _ = run(*words, "--out", tmp_path / "out")
@@ -375,10 +412,12 @@ def test_a_map_is_written(run, scan, tmp_path, monkeypatch, real_figures):
 
 
 @pytest.mark.parametrize("command", [("plan", "--loads", 1), ("diggability", "--locations", 2)])
-def test_the_high_world_takes_both_of_its_models(run, scan, monkeypatch, command):
-    asked = []
+def test_the_high_world_takes_both_of_its_models(
+    run: Run, scan: str, monkeypatch: pytest.MonkeyPatch, command: tuple[object, ...]
+) -> None:
+    asked: list[tuple[str, str | None, str | None]] = []
 
-    def load_world(name, **options):
+    def load_world(name: str, **options: Any) -> FakeWorld:
         asked.append((name, options.get("model"), options.get("pile_state")))
         return FakeWorld(1.0, options["soil"])
 
@@ -392,14 +431,17 @@ def test_the_high_world_takes_both_of_its_models(run, scan, monkeypatch, command
     assert (document["model"], document["pile_state"]) == (given["psi_high"], given["phi"])
     asked.clear()
     code, out, _ = run(*words)
-    assert asked[0] == ("high", None, None)
+    first, *_ = asked
+    assert first == ("high", None, None)
     assert not {"model", "pile_state"} & set(strict_json(out))
 
 
 # --- soil and machine
 
 
-def test_the_soil_of_the_options_is_in_every_world_and_the_ledger(run, scan, asked):
+def test_the_soil_of_the_options_is_in_every_world_and_the_ledger(
+    run: Run, scan: str, asked: list[tuple[str, Soil, WheelLoader]]
+) -> None:
     code, out, err = run("plan", scan, "--loads", 1, "--soil", "sand", "--json")
     assert code == 0
     assert asked == [("hybrid", SAND, WA320), ("simulator", SAND, WA320)]
@@ -411,7 +453,9 @@ def test_the_soil_of_the_options_is_in_every_world_and_the_ledger(run, scan, ask
     assert "trained for gravel and the WA320, not for sand:" in err
 
 
-def test_a_plan_is_played_with_its_own_soil_and_machine(run, scan, asked, tmp_path):
+def test_a_plan_is_played_with_its_own_soil_and_machine(
+    run: Run, scan: str, asked: list[tuple[str, Soil, WheelLoader]], tmp_path: Path
+) -> None:
     given = tmp_path / "narrow.toml"
     given.write_text("bucket_width = 2.0\ntilt_speed_deg = 30\n")
     narrow = dataclasses.replace(WA320, bucket_width=2.0, tilt_speed=math.radians(30.0))
@@ -433,7 +477,9 @@ def test_a_plan_is_played_with_its_own_soil_and_machine(run, scan, asked, tmp_pa
     assert json.loads(out)["ledger"]["density"] == pytest.approx(GRAVEL.density / 1000.0)
 
 
-def test_without_options_it_is_gravel_and_the_wa320_and_nothing_is_told(run, scan, asked):
+def test_without_options_it_is_gravel_and_the_wa320_and_nothing_is_told(
+    run: Run, scan: str, asked: list[tuple[str, Soil, WheelLoader]]
+) -> None:
     _, out, err = run("plan", scan, "--loads", 1, "--json")
     assert {entry[1:] for entry in asked} == {(GRAVEL, WA320)}
     assert "note" not in err
@@ -453,14 +499,18 @@ def test_without_options_it_is_gravel_and_the_wa320_and_nothing_is_told(run, sca
         ({"name": "sand", "parameters": {"densty": 1.0}}, "densty"),
     ],
 )
-def test_a_plan_with_a_soil_that_cannot_be_is_refused(run, scan, tmp_path, record, word):
+def test_a_plan_with_a_soil_that_cannot_be_is_refused(
+    run: Run, scan: str, tmp_path: Path, record: object, word: str
+) -> None:
     run("plan", scan, "--loads", 1, "--out", tmp_path / "out")
     path = tmp_path / "out" / "plan.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "soil": record}))
     refused(run("simulate", scan, path), str(path), word)
 
 
-def test_a_map_has_its_soil_and_machine(run, scan, asked):
+def test_a_map_has_its_soil_and_machine(
+    run: Run, scan: str, asked: list[tuple[str, Soil, WheelLoader]]
+) -> None:
     code, out, err = run("diggability", scan, "--locations", 3, "--soil", "clay", "--json")
     assert code == 0
     assert "trained for gravel" in err
@@ -479,8 +529,14 @@ def test_a_map_has_its_soil_and_machine(run, scan, asked):
     ],
 )
 def test_a_soil_or_machine_that_cannot_be_is_one_line(
-    run, tmp_path, asked, command, option, text, told
-):
+    run: Run,
+    tmp_path: Path,
+    asked: list[tuple[str, Soil, WheelLoader]],
+    command: str,
+    option: str,
+    text: str,
+    told: str,
+) -> None:
     (tmp_path / "given.toml").write_text(text)
     piles = ("bundled", "plan.json") if command == "simulate" else ("bundled",)
     refused(run(command, *piles, option, tmp_path / "given.toml"), "given.toml", told)
@@ -557,13 +613,15 @@ def test_a_soil_or_machine_that_cannot_be_is_one_line(
         (["evaluate", "--data", "missing"], "no such data set"),
     ],
 )
-def test_bad_usage_is_one_line(run, tmp_path, monkeypatch, words, told):
+def test_bad_usage_is_one_line(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], told: str
+) -> None:
     monkeypatch.chdir(tmp_path)
     refused(run(*words), told)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_bad_input_is_one_line(run, scan, tmp_path):
+def test_bad_input_is_one_line(run: Run, scan: str, tmp_path: Path) -> None:
     (tmp_path / "bad.npz").write_text("no pile")
     (tmp_path / "pile.doc").write_text("no pile")
     (tmp_path / "file").write_text("mine")
@@ -578,12 +636,14 @@ def test_bad_input_is_one_line(run, scan, tmp_path):
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a folder that nobody can write")
-def test_a_folder_that_cannot_be_written_is_refused_before_anything_runs(run, scan, calls):
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_runs(
+    run: Run, scan: str, calls: list[dict[str, Any]]
+) -> None:
     refused(run("plan", scan, "--out", "/proc/out"), "cannot be written")
     assert calls == []
 
 
-def test_a_folder_in_the_way_of_a_file_is_told(run, scan, tmp_path):
+def test_a_folder_in_the_way_of_a_file_is_told(run: Run, scan: str, tmp_path: Path) -> None:
     (tmp_path / "out" / "plan.png").mkdir(parents=True)
     code, out, err = run("plan", scan, "--loads", 1, "--out", tmp_path / "out")
     assert (code, out) == (2, "")
@@ -592,8 +652,8 @@ def test_a_folder_in_the_way_of_a_file_is_told(run, scan, tmp_path):
 
 
 def test_a_place_for_data_that_cannot_be_written_is_refused_and_nothing_left(
-    run, tmp_path, monkeypatch
-):
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(dataset, "collect", lambda *_, **__: pytest.fail("has begun"))
     (tmp_path / "file").write_text("mine")
     refused(run("collect", "--out", tmp_path / "file"), "is a file")
@@ -603,7 +663,9 @@ def test_a_place_for_data_that_cannot_be_written_is_refused_and_nothing_left(
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_collect_takes_soil_and_machine(run, monkeypatch, tmp_path):
+def test_collect_takes_soil_and_machine(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     (tmp_path / "narrow.toml").write_text("bucket_width = 2.0\n")
     simulators = []
     monkeypatch.setattr(
@@ -621,24 +683,24 @@ def test_collect_takes_soil_and_machine(run, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("command", sorted(cli.wlplan.commands))
-def test_every_command_explains_itself_and_has_the_common_options(run, command):
+def test_every_command_explains_itself_and_has_the_common_options(run: Run, command: str) -> None:
     code, out, err = run(command, "--help")
     assert (code, err) == (0, "")
     for option in ("--seed", "--json", "--help"):
         assert option in out
 
 
-def test_no_command_shows_the_help(run):
+def test_no_command_shows_the_help(run: Run) -> None:
     code, out, err = run()
     assert (code, err) == (0, "")
     assert "diggability" in out
 
 
-def test_the_names_offered_are_those_that_exist():
+def test_the_names_offered_are_those_that_exist() -> None:
     assert cli.options.PROTOCOLS == dataset.PROTOCOLS
 
 
-def test_the_report_stands_alone_and_escapes_names(run, tmp_path):
+def test_the_report_stands_alone_and_escapes_names(run: Run, tmp_path: Path) -> None:
     name = "<b>&'x\".npz"
     path = tmp_path / name
     io.write_pile(path, seed_pile("conical", slope=math.radians(30.0), height=2.0, seed=1))
@@ -648,13 +710,15 @@ def test_the_report_stands_alone_and_escapes_names(run, tmp_path):
     page = Page(source)
     assert name in page.text
     assert len(page.links) == 2
-    assert all(link.startswith("data:image/png;base64,") for link in page.links)
+    assert all((link or "").startswith("data:image/png;base64,") for link in page.links)
     assert "script" not in page.tags
 
 
-def test_progress_tells_rate_and_remaining_time(capsys, monkeypatch):
+def test_progress_tells_rate_and_remaining_time(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     clock = iter([0.0, 30.0, 41.0, 60.0, 71.0])
-    monkeypatch.setattr(cli.progress.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     with cli.progress.Progress() as progress:
         # 100 were there; the first 10 took 30 s, compiling included, and do not count.
         for done in (100, 110, 132, 170, 192):
@@ -668,7 +732,7 @@ def test_progress_tells_rate_and_remaining_time(capsys, monkeypatch):
     ]
 
 
-def test_compiling_inside_of_tracing_counts_once(monkeypatch):
+def test_compiling_inside_of_tracing_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
     watch = cli.progress.Stopwatch()
     with watch:
         now = time.perf_counter()
@@ -681,7 +745,7 @@ def test_compiling_inside_of_tracing_counts_once(monkeypatch):
 # --- as a process
 
 
-def process(*words, **options):
+def process(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "wlplan", *words],
         capture_output=True,
@@ -692,7 +756,7 @@ def process(*words, **options):
     )
 
 
-def test_help_is_quick_and_imports_nothing_heavy():
+def test_help_is_quick_and_imports_nothing_heavy() -> None:
     code = (
         "import sys, wlplan.cli; "
         "heavy = ('jax', 'matplotlib', 'scipy', 'numpy', 'jinja2'); "
@@ -704,7 +768,7 @@ def test_help_is_quick_and_imports_nothing_heavy():
     assert done.stdout.strip() == "[]"
 
 
-def test_an_unknown_ending_is_refused_before_anything_heavy_is_imported(tmp_path):
+def test_an_unknown_ending_is_refused_before_anything_heavy_is_imported(tmp_path: Path) -> None:
     (tmp_path / "pile.abc").write_text("1 2 3")
     code = (
         "import sys, wlplan.cli; code = wlplan.cli.main(['plan', 'pile.abc']); "
@@ -723,14 +787,14 @@ def test_an_unknown_ending_is_refused_before_anything_heavy_is_imported(tmp_path
     assert done.stderr.count("\n") == 1
 
 
-def test_bad_usage_as_a_process(tmp_path):
+def test_bad_usage_as_a_process(tmp_path: Path) -> None:
     done = process("plan", "--loads", "0", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1
 
 
-def test_bad_input_as_a_process(tmp_path):
+def test_bad_input_as_a_process(tmp_path: Path) -> None:
     (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04")
     done = process("plan", "bad.npz", "--out", "out", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")

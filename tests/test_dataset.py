@@ -18,7 +18,9 @@ import sys
 import threading
 import time
 import types
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -48,10 +50,11 @@ from wlplan.dataset import store as stored
 from wlplan.dataset.layout import Layout
 from wlplan.dataset.protocol import Episode, choose_pose
 from wlplan.dataset.worker import simulator_from_json
-from wlplan.dataset.worker_pool import CollectionSettings, WorkerProcess
+from wlplan.dataset.worker_pool import CollectionSettings, FinishedEpisode, WorkerProcess
 from wlplan.engines.simulator import STOP_REASONS, Simulator
 from wlplan.engines.simulator.cycle import Settings
 from wlplan.errors import InputError
+from wlplan.io import provenance
 from wlplan.models.normaliser import Normaliser
 from wlplan.site.machine import WA320
 from wlplan.site.soil import GRAVEL
@@ -66,7 +69,7 @@ LONGER = 17
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _short_episodes():
+def _short_episodes() -> Iterator[None]:
     """Episodes of 3 loadings, two a batch: 11 cycles make two batches."""
     with pytest.MonkeyPatch.context() as patch:
         for part in (layout, protocol, worker_pool, collecting, stored):
@@ -76,12 +79,12 @@ def _short_episodes():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def kept_workers():
+def kept_workers() -> Iterator[list[WorkerProcess]]:
     """All workers of this module; they stay from one collection to the next, so compile once."""
-    kept = []
+    kept: list[WorkerProcess] = []
 
     @contextlib.contextmanager
-    def pool(count):
+    def pool(count: int) -> Iterator[list[WorkerProcess]]:
         kept.extend(WorkerProcess() for _ in range(count - len(kept)))
         yield kept[:count]
 
@@ -93,13 +96,13 @@ def kept_workers():
 
 
 @pytest.fixture
-def worker(kept_workers, store):
+def worker(kept_workers: list[WorkerProcess], store: Path) -> WorkerProcess:
     """A worker that has compiled before."""
     return kept_workers[0]
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory):
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("dataset") / "data.zarr"
     seen = []
     collect(path, cycles=CYCLES, seed=SEED, progress=lambda done, total: seen.append((done, total)))
@@ -110,21 +113,21 @@ def store(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def data(store):
+def data(store: Path) -> Dataset:
     return open_dataset(store)
 
 
 @pytest.fixture
-def copy(store, tmp_path):
+def copy(store: Path, tmp_path: Path) -> Path:
     return shutil.copytree(store, tmp_path / "copy.zarr")
 
 
-def contents(path):
+def contents(path: Path) -> dict[Path, bytes]:
     """Every file of a store by name."""
     return {p.relative_to(path): p.read_bytes() for p in path.rglob("*") if p.is_file()}
 
 
-def contents_but_command(path):
+def contents_but_command(path: Path) -> tuple[dict[Path, bytes], str]:
     """`contents`, without the words that the processes were started with."""
     found = contents(path)
     document = json.loads(found.pop(Path("zarr.json")))
@@ -133,14 +136,14 @@ def contents_but_command(path):
 
 
 @pytest.fixture(scope="module")
-def longer(tmp_path_factory):
+def longer(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("longer") / "data.zarr"
     collect(path, cycles=LONGER, seed=SEED)
     return path
 
 
 @pytest.fixture(scope="module")
-def shards(tmp_path_factory):
+def shards(tmp_path_factory: pytest.TempPathFactory) -> dict[int, list[Path]]:
     """Number of shards -> all of them."""
     folder = tmp_path_factory.mktemp("shards")
     made = {n: [folder / f"{i}-of-{n}.zarr" for i in range(1, n + 1)] for n in (2, 3)}
@@ -151,12 +154,12 @@ def shards(tmp_path_factory):
 
 
 @pytest.fixture
-def parts(shards, tmp_path):
+def parts(shards: dict[int, list[Path]], tmp_path: Path) -> list[Path]:
     """Three shards to spoil."""
     return [shutil.copytree(path, tmp_path / "parts" / path.name) for path in shards[3]]
 
 
-def numbered(rollouts, loads=3):
+def numbered(rollouts: int, loads: int = 3) -> Dataset:
     """A data set of zeros, but for the number of the rollout."""
     n = rollouts * loads
     columns = {name: np.zeros((n, *v.shape), v.dtype) for name, v in VARIABLES.items()}
@@ -164,7 +167,7 @@ def numbered(rollouts, loads=3):
     return Dataset(**columns, attributes={})
 
 
-def forget(path, name):
+def forget(path: Path, name: str) -> None:
     """Takes a variable out of a store, as if it had never been there."""
     shutil.rmtree(path / name)
     document = json.loads((path / "zarr.json").read_text())
@@ -172,7 +175,7 @@ def forget(path, name):
     (path / "zarr.json").write_text(json.dumps(document))
 
 
-def refused(call, *words):
+def refused(call: Callable[[], object], *words: str) -> None:
     with pytest.raises(InputError) as error:
         call()
     message = str(error.value)
@@ -185,7 +188,7 @@ def refused(call, *words):
 # --- what is stored
 
 
-def test_every_cycle_is_there_and_in_order(data):
+def test_every_cycle_is_there_and_in_order(data: Dataset) -> None:
     assert len(data) == CYCLES
     assert data.rollout.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3]
     assert data.load.tolist() == [0, 1, 2] * 3 + [0, 1]
@@ -193,7 +196,7 @@ def test_every_cycle_is_there_and_in_order(data):
     assert data.valid.all()
 
 
-def test_the_outcomes_are_those_of_loading_cycles(data):
+def test_the_outcomes_are_those_of_loading_cycles(data: Dataset) -> None:
     for name in ("mass", "time", "work", "fill_time"):
         assert np.all(getattr(data, name) > 0.0)
     assert np.all(data.mass < 6.0)
@@ -203,14 +206,14 @@ def test_the_outcomes_are_those_of_loading_cycles(data):
     assert all(np.isfinite(getattr(data, name)).all() for name in VARIABLES)
 
 
-def test_the_actions_fill_their_box(data):
+def test_the_actions_fill_their_box(data: Dataset) -> None:
     assert np.all((data.action >= ACTION_LOW) & (data.action <= ACTION_HIGH))
     # One hypercube over the 6 x 3 loadings of a set: no two cycles share a slice.
     slices = np.floor(data.action / ACTION_HIGH * len(SEED_PILES) * 3)
     assert all(len(np.unique(column)) == CYCLES for column in slices.T)
 
 
-def test_the_maps_begin_at_the_reference_and_the_change_is_local(data):
+def test_the_maps_begin_at_the_reference_and_the_change_is_local(data: Dataset) -> None:
     # The centre line lies between two columns.
     assert np.all(np.abs(data.h36[:, 0, 17:19].mean(axis=1)) < 0.05)
     assert np.all(np.abs(data.h52[:, 0, 25:27]) < 0.05)
@@ -219,7 +222,7 @@ def test_the_maps_begin_at_the_reference_and_the_change_is_local(data):
     assert np.abs(data.h52_after - data.h52).max() < 1.5
 
 
-def test_the_smaller_map_after_is_a_part_of_the_larger(data):
+def test_the_smaller_map_after_is_a_part_of_the_larger(data: Dataset) -> None:
     level = data.h36[:, 0, 0] - data.h52[:, 10, 8]
     part = data.h52_after[:, 10:46, 8:44] + level[:, None, None]
     np.testing.assert_allclose(data.h36_after, part, atol=1e-5)
@@ -229,16 +232,17 @@ def test_the_smaller_map_after_is_a_part_of_the_larger(data):
     assert np.median(lost / data.mass) > 0.6
 
 
-def test_the_volume_that_the_map_loses_is_about_the_load(data):
+def test_the_volume_that_the_map_loses_is_about_the_load(data: Dataset) -> None:
     lost = (data.h52 - data.h52_after).sum(axis=(1, 2)) * CELL_SIZE**2 * GRAVEL.density / 1000.0
     # Soil slides into the map from above it, so a part of the load shows outside.
     assert np.all(lost < 1.05 * data.mass + 0.1)
     assert np.median(lost / data.mass) > 0.7
 
 
-def simulated(episode):
+def simulated(episode: Episode) -> Episode:
     """An episode after all its loadings, with no other beside it."""
-    episodes, finished = iter([episode]), []
+    episodes = iter([episode])
+    finished: list[Episode | None] = []
     vector_simulator.VectorSimulator(
         Simulator(), lambda: next(episodes, None), finished.append, threading.Event()
     ).run()
@@ -246,11 +250,14 @@ def simulated(episode):
     return episode
 
 
-def test_an_episode_does_not_depend_on_those_beside_it(data, worker):
+def test_an_episode_does_not_depend_on_those_beside_it(
+    data: Dataset, worker: WorkerProcess
+) -> None:
     for number in (0, 2):
-        numbers, finished = iter([number]), []
+        numbers = iter([number])
+        finished: list[Any] = []
         settings = CollectionSettings(Simulator(), SEED, 3, 3)
-        worker.simulate(settings, lambda numbers=numbers: next(numbers, None), finished.append)
+        worker.simulate(settings, functools.partial(next, numbers, None), finished.append)
         *loadings, (found, alone) = finished
         assert loadings == [None] * 3
         assert found == number
@@ -258,7 +265,7 @@ def test_an_episode_does_not_depend_on_those_beside_it(data, worker):
             np.testing.assert_array_equal(alone[name], getattr(data, name)[data.rollout == number])
 
 
-def test_what_left_the_grid_is_the_load():
+def test_what_left_the_grid_is_the_load() -> None:
     episode = Episode(3, SEED, 1, Simulator())
     episode.reset()
     before, origin = episode.height, episode.origin
@@ -277,7 +284,7 @@ def test_what_left_the_grid_is_the_load():
     np.testing.assert_allclose(smaller, smaller[0, 0], atol=1e-4)
 
 
-def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike():
+def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike() -> None:
     first, again, other = (Episode(3, seed, 3, Simulator()) for seed in (0, 0, 1))
     assert first.noise_seed == again.noise_seed != other.noise_seed
     np.testing.assert_array_equal(first.action, again.action)
@@ -287,10 +294,10 @@ def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike():
     assert headings.std() == pytest.approx(math.radians(20.0) / math.sqrt(12.0), rel=0.1)
 
 
-def test_a_corridor_is_dug_on_where_it_was_dug_before(worker):
-    def nearest(protocol):
+def test_a_corridor_is_dug_on_where_it_was_dug_before(worker: WorkerProcess) -> None:
+    def nearest(protocol: str) -> tuple[float, list[np.ndarray]]:
         """Median distance of a loading from the nearest before it."""
-        finished = []
+        finished: list[FinishedEpisode | None] = []
         settings, numbers = CollectionSettings(Simulator(), SEED, 12, 12, protocol), iter([0, 1])
         worker.simulate(settings, lambda: next(numbers, None), finished.append)
         episodes = sorted(episode for episode in finished if episode is not None)
@@ -307,7 +314,9 @@ def test_a_corridor_is_dug_on_where_it_was_dug_before(worker):
         np.testing.assert_array_equal(one[0], other[0])
 
 
-def test_slow_loadings_are_followed_by_ones_with_similar_actions(monkeypatch):
+def test_slow_loadings_are_followed_by_ones_with_similar_actions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The law of the protocol, with the fillings made up: every fourth is slow."""
     monkeypatch.setattr(protocol, "choose_pose", lambda *_: np.zeros(3, np.float32))
     span = np.subtract(ACTION_HIGH, ACTION_LOW)
@@ -321,15 +330,16 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(monkeypatch):
         last = None
         for load in range(30):
             _, action = mine.next_loading()
-            assert (action >= np.float32(ACTION_LOW)).all()
-            assert (action <= np.float32(ACTION_HIGH)).all()
+            assert (action >= np.asarray(ACTION_LOW, np.float32)).all()
+            assert (action <= np.asarray(ACTION_HIGH, np.float32)).all()
             new = np.array_equal(action, papers.action[load])
             assert new or last is not None  # none was slow: as in the paper's protocol
             if last is not None:
                 count += 1
                 fresh += new
                 # Those at the edge of the range would have gone beyond it.
-                inside = (action > np.float32(ACTION_LOW)) & (action < np.float32(ACTION_HIGH))
+                low, high = (np.asarray(ends, np.float32) for ends in (ACTION_LOW, ACTION_HIGH))
+                inside = (action > low) & (action < high)
                 if not new:
                     middle = np.abs(last - np.array(ACTION_LOW) - 0.5 * span) < 0.2 * span
                     steps.extend(((action - last) / span)[inside & middle])
@@ -345,9 +355,9 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(monkeypatch):
     assert len(steps) > 1000
 
 
-def test_up_to_the_first_slow_loading_the_protocol_is_the_papers(worker):
-    def episodes(protocol):
-        finished = []
+def test_up_to_the_first_slow_loading_the_protocol_is_the_papers(worker: WorkerProcess) -> None:
+    def episodes(protocol: str) -> list[FinishedEpisode]:
+        finished: list[FinishedEpisode | None] = []
         settings, numbers = CollectionSettings(Simulator(), SEED, 20, 20, protocol), iter([0, 1])
         worker.simulate(settings, lambda: next(numbers, None), finished.append)
         return sorted(episode for episode in finished if episode is not None)
@@ -366,7 +376,7 @@ def test_up_to_the_first_slow_loading_the_protocol_is_the_papers(worker):
     assert followed
 
 
-def test_a_protocol_is_part_of_what_a_data_set_is(copy):
+def test_a_protocol_is_part_of_what_a_data_set_is(copy: Path) -> None:
     refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="corridor"), "protocol")
     refused(
         lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="other"), "paper, corridor, slow"
@@ -374,7 +384,7 @@ def test_a_protocol_is_part_of_what_a_data_set_is(copy):
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30, 31, 47, 449, 451, 1801, 10_718, 10_800])
-def test_the_batches_make_up_the_cycles(cycles, monkeypatch):
+def test_the_batches_make_up_the_cycles(cycles: int, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("LOADS", 30), ("_BATCH", 60)):
         monkeypatch.setattr(layout, name, value)
     whole = Layout(cycles)
@@ -382,7 +392,7 @@ def test_the_batches_make_up_the_cycles(cycles, monkeypatch):
     assert whole.batch_cycles == cycles or whole.batch_cycles % 30 == 0
 
 
-def test_a_hypercube_has_one_point_in_each_slice():
+def test_a_hypercube_has_one_point_in_each_slice() -> None:
     points = latin_hypercube(50, 4, np.random.default_rng(0))
     assert points.shape == (50, 4)
     for column in points.T:
@@ -391,22 +401,24 @@ def test_a_hypercube_has_one_point_in_each_slice():
     assert np.abs(np.corrcoef(points.T) - np.eye(4)).max() < 0.5
 
 
-def test_nothing_is_chosen_where_nothing_is_left():
+def test_nothing_is_chosen_where_nothing_is_left() -> None:
     flat = Pile(jnp.zeros((60, 60)), CELL_SIZE, jnp.zeros(2))
     assert choose_pose(flat, 0.5, 0.0) is None
 
 
 @pytest.mark.parametrize("place", [0.0, 0.5, 1.0])
-def test_a_pose_heads_into_the_pile(place):
+def test_a_pose_heads_into_the_pile(place: float) -> None:
     pile = seed_pile("conical", slope=math.radians(30.0), noise=0.0)
-    x, y, heading = choose_pose(pile, place, 0.1)
+    pose = choose_pose(pile, place, 0.1)
+    assert pose is not None
+    x, y, heading = pose
     inward = math.atan2(-y, -x)
     assert abs((heading - inward + math.pi) % (2.0 * math.pi) - math.pi) == pytest.approx(
         0.1, abs=0.05
     )
 
 
-def test_the_store_says_what_it_holds(store):
+def test_the_store_says_what_it_holds(store: Path) -> None:
     document = json.loads((store / "zarr.json").read_text())
     attributes = document["attributes"]
     assert attributes["format"] == "wlplan.dataset/1"
@@ -423,7 +435,9 @@ def test_the_store_says_what_it_holds(store):
     assert not store.with_name("data.zarr.lock").exists()
 
 
-def test_a_data_set_of_a_version_without_the_smaller_map_after_is_read(data, copy):
+def test_a_data_set_of_a_version_without_the_smaller_map_after_is_read(
+    data: Dataset, copy: Path
+) -> None:
     forget(copy, "h36_after")
     earlier = open_dataset(copy)
     np.testing.assert_allclose(earlier.h36_after, data.h36_after, atol=1e-6)
@@ -433,7 +447,7 @@ def test_a_data_set_of_a_version_without_the_smaller_map_after_is_read(data, cop
     refused(lambda: collect(copy, cycles=CYCLES, seed=SEED), "h36_after", "another version")
 
 
-def test_a_data_set_without_another_variable_is_damaged(copy):
+def test_a_data_set_without_another_variable_is_damaged(copy: Path) -> None:
     forget(copy, "h52_after")
     refused(lambda: open_dataset(copy), "damaged", "h52_after")
 
@@ -442,10 +456,12 @@ def test_a_data_set_without_another_variable_is_damaged(copy):
 
 
 @pytest.mark.parametrize("after", [0, 4, 9])
-def test_a_collection_that_was_cut_short_ends_with_the_same_bytes(store, tmp_path, after):
+def test_a_collection_that_was_cut_short_ends_with_the_same_bytes(
+    store: Path, tmp_path: Path, after: int
+) -> None:
     path = tmp_path / "data.zarr"
 
-    def stop(done, total):
+    def stop(done: int, total: int) -> None:
         if done >= after:
             raise KeyboardInterrupt
 
@@ -456,10 +472,10 @@ def test_a_collection_that_was_cut_short_ends_with_the_same_bytes(store, tmp_pat
     assert contents(path) == contents(store)
 
 
-def test_missing_directories_above_are_made(tmp_path):
+def test_missing_directories_above_are_made(tmp_path: Path) -> None:
     path = tmp_path / "not" / "yet" / "data.zarr"
 
-    def stop(done, total):
+    def stop(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -468,13 +484,15 @@ def test_missing_directories_above_are_made(tmp_path):
 
 
 @pytest.mark.parametrize("cores", [1, 3])
-def test_the_number_of_cores_does_not_show(store, tmp_path, monkeypatch, cores):
+def test_the_number_of_cores_does_not_show(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
+) -> None:
     monkeypatch.setattr(worker_pool, "cores", lambda: cores)
     collect(tmp_path / "data.zarr", cycles=CYCLES, seed=SEED)
     assert contents(tmp_path / "data.zarr") == contents(store)
 
 
-def test_what_goes_wrong_in_a_worker_is_not_lost(worker):
+def test_what_goes_wrong_in_a_worker_is_not_lost(worker: WorkerProcess) -> None:
     settings = CollectionSettings(Simulator(), -1, 3, 3)
     numbers = iter([0])
     with pytest.raises(RuntimeError, match="non-negative"):
@@ -483,18 +501,20 @@ def test_what_goes_wrong_in_a_worker_is_not_lost(worker):
     worker.simulate(dataclasses.replace(settings, seed=0), lambda: None, lambda _: None)
 
 
-def test_the_end_of_a_worker_is_said_in_one_line(tmp_path, monkeypatch):
+def test_the_end_of_a_worker_is_said_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     workers = []
 
     @contextlib.contextmanager
-    def pool(count):
+    def pool(count: int) -> Iterator[list[WorkerProcess]]:
         workers.append(WorkerProcess())
         try:
             yield workers
         finally:
             workers[0].close()
 
-    def kill(layout, start, news, progress):
+    def kill(layout: Layout, start: int, news: queue.SimpleQueue[Any], progress: object) -> None:
         workers[0].process.kill()
         raise news.get()
 
@@ -505,16 +525,20 @@ def test_the_end_of_a_worker_is_said_in_one_line(tmp_path, monkeypatch):
     assert "collect" not in [thread.name for thread in threading.enumerate()]
 
 
-def test_a_worker_ends_with_its_collector():
+def test_a_worker_ends_with_its_collector() -> None:
     """Whatever way that ends: all it sees is the end of its input."""
     worker = WorkerProcess()
+    assert worker.process.stdin is not None
+    assert worker.process.stdout is not None
     worker.process.stdin.close()
     assert worker.process.wait(timeout=300.0) == 0
     worker.process.stdout.close()
 
 
 @pytest.mark.parametrize("relative", [False, True])
-def test_a_worker_imports_nothing_from_the_working_directory(tmp_path, monkeypatch, relative):
+def test_a_worker_imports_nothing_from_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, relative: bool
+) -> None:
     """Whatever lies there: modules of Python, of a dependency, of the package itself."""
     for name in ("queue", "json", "numpy", "importlib", "encodings", "wlplan", "sitecustomize"):
         (tmp_path / f"{name}.py").write_text("open('executed', 'w').close()\nraise SystemExit(3)\n")
@@ -529,7 +553,9 @@ def test_a_worker_imports_nothing_from_the_working_directory(tmp_path, monkeypat
     assert not (tmp_path / "executed").exists()
 
 
-def test_a_worker_imports_from_where_its_collector_does(tmp_path, monkeypatch):
+def test_a_worker_imports_from_where_its_collector_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Folders that were added by hand, and the very package, though another one comes first."""
     (tmp_path / "queue.py").write_text(
         f"open('executed', 'w').close()\nexec(open({queue.__file__!r}).read())\n"
@@ -545,7 +571,7 @@ def test_a_worker_imports_from_where_its_collector_does(tmp_path, monkeypatch):
     assert (tmp_path / "executed").exists()
 
 
-def test_a_worker_has_the_simulator_of_its_collector():
+def test_a_worker_has_the_simulator_of_its_collector() -> None:
     other = Simulator(
         soil=dataclasses.replace(GRAVEL, density=1500.0),
         machine=dataclasses.replace(WA320, bucket_width=2.6),
@@ -556,7 +582,7 @@ def test_a_worker_has_the_simulator_of_its_collector():
     assert simulator_from_json(message["simulator"]) == other
 
 
-def test_a_batch_that_was_half_written_is_written_again(store, copy):
+def test_a_batch_that_was_half_written_is_written_again(store: Path, copy: Path) -> None:
     stored.update_attributes(copy, {"cycles_done": 6})
     chunk = copy / "h52" / "c" / "1" / "0" / "0"
     chunk.write_bytes(chunk.read_bytes()[:100])
@@ -566,7 +592,7 @@ def test_a_batch_that_was_half_written_is_written_again(store, copy):
     assert contents(copy) == contents(store)
 
 
-def test_a_complete_collection_is_left_alone(copy):
+def test_a_complete_collection_is_left_alone(copy: Path) -> None:
     before = contents(copy)
     collect(copy, cycles=CYCLES, seed=SEED)
     assert contents(copy) == before
@@ -583,20 +609,22 @@ def test_a_complete_collection_is_left_alone(copy):
         ),
     ],
 )
-def test_another_collection_does_not_go_on_in_the_same_place(copy, changed, word):
+def test_another_collection_does_not_go_on_in_the_same_place(
+    copy: Path, changed: dict[str, Any], word: str
+) -> None:
     before = contents(copy)
     refused(lambda: collect(copy, **{"cycles": CYCLES, "seed": SEED, **changed}), word)
     assert contents(copy) == before
 
 
-def test_two_processes_do_not_write_the_same_store(copy):
+def test_two_processes_do_not_write_the_same_store(copy: Path) -> None:
     lock = copy.with_name("copy.zarr.lock")
     lock.write_text(f"{os.getpid()} {stored._start_of(os.getpid())} {socket.gethostname()}")
     refused(lambda: collect(copy, cycles=CYCLES, seed=SEED), str(os.getpid()), lock.name)
     assert lock.exists()
 
 
-def test_a_lock_that_is_not_signed_yet_is_left_alone(copy):
+def test_a_lock_that_is_not_signed_yet_is_left_alone(copy: Path) -> None:
     lock = copy.with_name("copy.zarr.lock")
     lock.write_text("")
     refused(lambda: collect(copy, cycles=CYCLES, seed=SEED), "is being written", lock.name)
@@ -604,7 +632,7 @@ def test_a_lock_that_is_not_signed_yet_is_left_alone(copy):
 
 
 @pytest.mark.parametrize("holder", ["", "99999999 1 {host}", "{pid} 1 {host}", "nonsense"])
-def test_the_lock_of_a_dead_process_is_taken_over(copy, holder):
+def test_the_lock_of_a_dead_process_is_taken_over(copy: Path, holder: str) -> None:
     lock = copy.with_name("copy.zarr.lock")
     lock.write_text(holder.format(pid=os.getpid(), host=socket.gethostname()))
     os.utime(lock, (0.0, 0.0))
@@ -612,11 +640,13 @@ def test_the_lock_of_a_dead_process_is_taken_over(copy, holder):
     assert not lock.exists()
 
 
-def test_a_full_disk_is_said_in_one_line_and_costs_nothing(store, tmp_path, monkeypatch):
+def test_a_full_disk_is_said_in_one_line_and_costs_nothing(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "data.zarr"
     write = stored.write
 
-    def fails(path, batch, start):
+    def fails(path: Path, batch: dict[str, np.ndarray], start: int) -> None:
         if start > 0:
             raise OSError(errno.ENOSPC, "No space left on device")
         write(path, batch, start)
@@ -628,7 +658,7 @@ def test_a_full_disk_is_said_in_one_line_and_costs_nothing(store, tmp_path, monk
     assert contents(path) == contents(store)
 
 
-def test_other_things_are_not_overwritten(tmp_path):
+def test_other_things_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("keep me")
     refused(lambda: collect(tmp_path, cycles=3), "not a data set")
     refused(lambda: collect(tmp_path / "note.txt", cycles=3), "not a data set")
@@ -643,7 +673,9 @@ def test_other_things_are_not_overwritten(tmp_path):
 
 
 @pytest.mark.parametrize("cycles", [1, 1799, 1801, 10_800, 108_001, 1_000_000])
-def test_the_shards_are_even_portions_of_whole_batches(cycles, monkeypatch):
+def test_the_shards_are_even_portions_of_whole_batches(
+    cycles: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, value in (("LOADS", 30), ("_BATCH", 60)):
         monkeypatch.setattr(layout, name, value)
     batches = Layout(cycles).batches
@@ -658,20 +690,22 @@ def test_the_shards_are_even_portions_of_whole_batches(cycles, monkeypatch):
 
 
 @pytest.mark.parametrize(("number", "count"), [(0, 3), (4, 3), (-1, 3), (1, 0)])
-def test_there_are_no_other_shards_than_those(tmp_path, number, count):
+def test_there_are_no_other_shards_than_those(tmp_path: Path, number: int, count: int) -> None:
     call = functools.partial(collect, tmp_path / "x.zarr", cycles=LONGER)
     refused(lambda: call(shard=(number, count)), f"no shard {number}/{count}")
     assert not any(tmp_path.iterdir())
 
 
-def test_more_shards_than_batches_are_refused(tmp_path):
+def test_more_shards_than_batches_are_refused(tmp_path: Path) -> None:
     call = functools.partial(collect, tmp_path / "x.zarr", cycles=LONGER)
     refused(lambda: call(shard=(1, 4)), "at most 3", "6 cycles")
     assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0), (0, 1, 2), (2, 0, 1)])
-def test_merged_shards_are_the_bytes_of_a_single_collector(longer, shards, tmp_path, order):
+def test_merged_shards_are_the_bytes_of_a_single_collector(
+    longer: Path, shards: dict[int, list[Path]], tmp_path: Path, order: tuple[int, ...]
+) -> None:
     paths = [shards[len(order)][i] for i in order]
     before = [contents(path) for path in paths]
     seen = []
@@ -684,7 +718,9 @@ def test_merged_shards_are_the_bytes_of_a_single_collector(longer, shards, tmp_p
     assert [entry.name for entry in out.parent.iterdir()] == ["data.zarr"]
 
 
-def test_a_shard_says_what_it_is_and_is_not_taken_for_the_whole(shards, longer):
+def test_a_shard_says_what_it_is_and_is_not_taken_for_the_whole(
+    shards: dict[int, list[Path]], longer: Path
+) -> None:
     path = shards[2][1]
     attributes = json.loads((path / "zarr.json").read_text())["attributes"]
     assert {name: attributes[name] for name in stored.SHARD_ATTRIBUTES} == {
@@ -702,11 +738,13 @@ def test_a_shard_says_what_it_is_and_is_not_taken_for_the_whole(shards, longer):
 
 
 @pytest.mark.parametrize("after", [0, 4, 9])
-def test_a_shard_that_was_cut_short_ends_with_the_same_bytes(shards, tmp_path, after):
+def test_a_shard_that_was_cut_short_ends_with_the_same_bytes(
+    shards: dict[int, list[Path]], tmp_path: Path, after: int
+) -> None:
     call = functools.partial(collect, tmp_path / "x.zarr", cycles=LONGER, seed=SEED, shard=(2, 2))
     seen = []
 
-    def stop(done, total):
+    def stop(done: int, total: int) -> None:
         seen.append((done, total))
         if done >= after:
             raise KeyboardInterrupt
@@ -729,14 +767,16 @@ def test_a_shard_that_was_cut_short_ends_with_the_same_bytes(shards, tmp_path, a
         ({"seed": 6}, "seed"),
     ],
 )
-def test_another_collection_does_not_go_on_in_the_place_of_a_shard(parts, changed, word):
+def test_another_collection_does_not_go_on_in_the_place_of_a_shard(
+    parts: list[Path], changed: dict[str, Any], word: str
+) -> None:
     before = contents(parts[0])
     wanted = {"cycles": LONGER, "seed": SEED, "shard": (1, 3), **changed}
     refused(lambda: collect(parts[0], **wanted), word)
     assert contents(parts[0]) == before
 
 
-def test_a_whole_data_set_does_not_go_on_as_a_shard(copy):
+def test_a_whole_data_set_does_not_go_on_as_a_shard(copy: Path) -> None:
     refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, shard=(1, 1)), "a whole data set")
 
 
@@ -754,13 +794,17 @@ def test_a_whole_data_set_does_not_go_on_as_a_shard(copy):
         ({"format": "wlplan.dataset/9"}, ("wlplan.dataset/9",)),
     ],
 )
-def test_shards_that_do_not_belong_together_are_refused(parts, tmp_path, changes, words):
+def test_shards_that_do_not_belong_together_are_refused(
+    parts: list[Path], tmp_path: Path, changes: dict[str, Any], words: tuple[str, ...]
+) -> None:
     stored.update_attributes(parts[1], changes)
     refused(lambda: merge(parts, tmp_path / "out.zarr"), parts[1].name, *words)
     assert [entry.name for entry in tmp_path.iterdir()] == ["parts"]
 
 
-def test_all_shards_are_needed_and_each_once(parts, shards, store, tmp_path):
+def test_all_shards_are_needed_and_each_once(
+    parts: list[Path], shards: dict[int, list[Path]], store: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out.zarr"
     refused(lambda: merge([], out), "no shards")
     refused(lambda: merge(parts[1:2], out), "shard 1/3, 3/3")
@@ -773,7 +817,7 @@ def test_all_shards_are_needed_and_each_once(parts, shards, store, tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["missing", "truncated", "no array", "other chunks"])
-def test_a_damaged_shard_is_refused(parts, tmp_path, damage):
+def test_a_damaged_shard_is_refused(parts: list[Path], tmp_path: Path, damage: str) -> None:
     chunk = parts[2] / "h52" / "c" / "0" / "0" / "0"
     metadata = parts[2] / "h52" / "zarr.json"
     if damage == "missing":
@@ -788,7 +832,7 @@ def test_a_damaged_shard_is_refused(parts, tmp_path, damage):
     assert [entry.name for entry in tmp_path.iterdir()] == ["parts"]
 
 
-def test_a_merge_that_is_done_is_left_alone(parts, tmp_path):
+def test_a_merge_that_is_done_is_left_alone(parts: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "out.zarr"
     merge(parts, out)
     before = contents(out)
@@ -798,7 +842,7 @@ def test_a_merge_that_is_done_is_left_alone(parts, tmp_path):
     refused(lambda: merge(parts, out), "out.zarr", "damaged")
 
 
-def test_other_things_are_not_merged_over(parts, copy, tmp_path):
+def test_other_things_are_not_merged_over(parts: list[Path], copy: Path, tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("keep me")
     before = contents(tmp_path)
     refused(lambda: merge(parts, copy), "not the data set of these shards")
@@ -811,8 +855,10 @@ def test_other_things_are_not_merged_over(parts, copy, tmp_path):
     assert contents(tmp_path) == before
 
 
-def test_a_collection_that_was_only_begun_is_not_merged_over(parts, tmp_path):
-    def stop(done, total):
+def test_a_collection_that_was_only_begun_is_not_merged_over(
+    parts: list[Path], tmp_path: Path
+) -> None:
+    def stop(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -820,19 +866,21 @@ def test_a_collection_that_was_only_begun_is_not_merged_over(parts, tmp_path):
     refused(lambda: merge(parts, tmp_path / "x.zarr"), "not the data set of these shards")
 
 
-def test_two_processes_do_not_merge_to_the_same_place(parts, tmp_path):
+def test_two_processes_do_not_merge_to_the_same_place(parts: list[Path], tmp_path: Path) -> None:
     lock = tmp_path / "out.zarr.lock"
     lock.write_text(f"{os.getpid()} {stored._start_of(os.getpid())} {socket.gethostname()}")
     refused(lambda: merge(parts, tmp_path / "out.zarr"), str(os.getpid()), lock.name)
     assert not (tmp_path / "out.zarr").exists()
 
 
-def test_a_merge_that_does_not_end_leaves_nothing(longer, parts, tmp_path, monkeypatch):
+def test_a_merge_that_does_not_end_leaves_nothing(
+    longer: Path, parts: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "out.zarr"
     before = [contents(path) for path in parts]
     write, written = merging._write, []
 
-    def full(path, content):
+    def full(path: Path, content: bytes) -> None:
         written.append(path)
         if len(written) > 20:
             raise OSError(errno.ENOSPC, "No space left on device")
@@ -843,7 +891,7 @@ def test_a_merge_that_does_not_end_leaves_nothing(longer, parts, tmp_path, monke
         refused(lambda: merge(parts, out), "No space", "free some space")
     assert [entry.name for entry in tmp_path.iterdir()] == ["parts"]
 
-    def stop(done, total):
+    def stop(done: int, total: int) -> None:
         if done:
             raise KeyboardInterrupt
 
@@ -859,7 +907,9 @@ def test_a_merge_that_does_not_end_leaves_nothing(longer, parts, tmp_path, monke
     assert [contents(path) for path in parts] == before
 
 
-def test_the_command_line_collects_shards_and_merges_them(shards, longer, tmp_path, capsys):
+def test_the_command_line_collects_shards_and_merges_them(
+    shards: dict[int, list[Path]], longer: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     names = [str(tmp_path / f"{i}.zarr") for i in (1, 2)]
     for i, name in enumerate(names, 1):
         words = ["collect", "--cycles", LONGER, "--seed", SEED, "--shard", f"{i}/2", "--json"]
@@ -900,14 +950,14 @@ sys.exit(cli.main(["collect", *sys.argv[1:]]))
 """
 
 
-def start(*words):
+def start(*words: object) -> subprocess.Popen[str]:
     """A process that collects."""
     return subprocess.Popen(
         [sys.executable, "-c", CHILD, *map(str, words)], stderr=subprocess.PIPE, text=True
     )
 
 
-def wait_until(condition, process):
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str]) -> None:
     """Waits for what a process that runs on is to bring about."""
     until = time.monotonic() + 300.0
     while not condition():
@@ -916,23 +966,28 @@ def wait_until(condition, process):
         time.sleep(0.005)
 
 
-def cycles_done(path):
+def cycles_done(path: Path) -> int:
     """Number of cycles in a store so far; -1 without a store."""
     try:
-        return json.loads((path / "zarr.json").read_text())["attributes"]["cycles_done"]
+        document = json.loads((path / "zarr.json").read_text())
     except FileNotFoundError:
         return -1
+    return int(document["attributes"]["cycles_done"])
 
 
 @pytest.mark.slow
-def test_a_killed_shard_goes_on_and_ends_with_the_same_bytes(tmp_path):
+def test_a_killed_shard_goes_on_and_ends_with_the_same_bytes(tmp_path: Path) -> None:
     cycles = 480
     collect(tmp_path / "want.zarr", cycles=cycles, seed=SEED, shard=(2, 2))
     path = tmp_path / "got.zarr"
     command = ("--cycles", cycles, "--seed", SEED, "--shard", "2/2", "--out", path)
     for least in (0, 6, 120):
         process = start(*command)
-        wait_until(lambda least=least: cycles_done(path) >= least, process)
+
+        def is_there(least: int = least) -> bool:
+            return cycles_done(path) >= least
+
+        wait_until(is_there, process)
         process.send_signal(signal.SIGKILL)
         process.communicate()
         assert process.returncode == -signal.SIGKILL
@@ -946,7 +1001,7 @@ def test_a_killed_shard_goes_on_and_ends_with_the_same_bytes(tmp_path):
 
 
 @pytest.mark.slow
-def test_of_two_collectors_at_once_one_is_refused(store, tmp_path):
+def test_of_two_collectors_at_once_one_is_refused(store: Path, tmp_path: Path) -> None:
     path = tmp_path / "data.zarr"
     command = ("--cycles", CYCLES, "--seed", SEED, "--out", path)
     first = start(*command)
@@ -965,7 +1020,7 @@ def test_of_two_collectors_at_once_one_is_refused(store, tmp_path):
 # --- reading
 
 
-def test_a_missing_or_foreign_store_is_refused(tmp_path, copy):
+def test_a_missing_or_foreign_store_is_refused(tmp_path: Path, copy: Path) -> None:
     refused(lambda: open_dataset(tmp_path / "nothing.zarr"), "no such data set")
     refused(lambda: open_dataset(tmp_path), "not a data set")
     stored.update_attributes(copy, {"format": "wlplan.dataset/9"})
@@ -975,7 +1030,7 @@ def test_a_missing_or_foreign_store_is_refused(tmp_path, copy):
 
 
 @pytest.mark.parametrize("damage", ["missing", "truncated", "no array"])
-def test_a_damaged_store_is_refused(copy, damage):
+def test_a_damaged_store_is_refused(copy: Path, damage: str) -> None:
     chunk = copy / "h36" / "c" / "1" / "0" / "0"
     if damage == "missing":
         chunk.unlink()
@@ -986,7 +1041,7 @@ def test_a_damaged_store_is_refused(copy, damage):
     refused(lambda: open_dataset(copy), "damaged")
 
 
-def test_the_fingerprint_tells_data_sets_apart(data, store):
+def test_the_fingerprint_tells_data_sets_apart(data: Dataset, store: Path) -> None:
     assert fingerprint(data) == fingerprint(open_dataset(store))
     other = dataclasses.replace(data, mass=data.mass + 1e-6)
     assert fingerprint(other) != fingerprint(data)
@@ -996,7 +1051,7 @@ def test_the_fingerprint_tells_data_sets_apart(data, store):
 
 
 @pytest.mark.parametrize("rollouts", [3, 10, 41, 360])
-def test_no_rollout_is_in_two_parts(rollouts):
+def test_no_rollout_is_in_two_parts(rollouts: int) -> None:
     whole = numbered(rollouts)
     parts = split(whole, seed=2)
     numbers = [np.unique(part.rollout) for part in parts]
@@ -1008,17 +1063,17 @@ def test_no_rollout_is_in_two_parts(rollouts):
     np.testing.assert_array_equal(again[2].rollout, parts[2].rollout)
 
 
-def test_too_few_rollouts_are_not_split():
+def test_too_few_rollouts_are_not_split() -> None:
     refused(lambda: split(numbered(2)), "2 rollouts")
     refused(lambda: split(numbered(5), fractions=(0.8, -0.1)), "positive")
 
 
-def test_reflecting_twice_changes_nothing(data):
+def test_reflecting_twice_changes_nothing(data: Dataset) -> None:
     np.testing.assert_array_equal(reflect(reflect(data.h52)), data.h52)
     np.testing.assert_array_equal(reflect(data.h36)[:, :, 0], data.h36[:, :, -1])
 
 
-def test_the_normaliser_maps_the_range_to_one_and_back():
+def test_the_normaliser_maps_the_range_to_one_and_back() -> None:
     table = np.random.default_rng(0).normal(3.0, 2.0, (50, 4)).astype(np.float32)
     table[:, 3] = 7.0  # never changes
     normaliser = Normaliser.of(table)
@@ -1030,10 +1085,10 @@ def test_the_normaliser_maps_the_range_to_one_and_back():
     np.testing.assert_allclose(back, table, rtol=1e-5)
 
 
-def test_the_command_is_one_to_type_again(monkeypatch):
+def test_the_command_is_one_to_type_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["/somewhere/bin/wlplan", "collect", "--out", "my data.zarr"])
     main = types.ModuleType("__main__")
     monkeypatch.setitem(sys.modules, "__main__", main)
-    assert stored.command() == "wlplan collect --out 'my data.zarr'"
+    assert provenance.command() == "wlplan collect --out 'my data.zarr'"
     main.__spec__ = importlib.machinery.ModuleSpec("wlplan.__main__", None)
-    assert stored.command() == "python -m wlplan collect --out 'my data.zarr'"
+    assert provenance.command() == "python -m wlplan collect --out 'my data.zarr'"

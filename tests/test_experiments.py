@@ -30,7 +30,7 @@ NAMES = sorted(
 NOT_RUN: set[str] = set()
 
 
-def test_there_are_experiments_and_each_can_run_and_draw():
+def test_there_are_experiments_and_each_can_run_and_draw() -> None:
     assert NAMES
     for name in NAMES:
         module = importlib.import_module(f"experiments.{name}")
@@ -39,7 +39,7 @@ def test_there_are_experiments_and_each_can_run_and_draw():
 
 
 @pytest.fixture(scope="session")
-def shared(tmp_path_factory):
+def shared(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Data set and models that the smoke presets collect and train once, not each its own."""
     folder = tmp_path_factory.mktemp("experiments")
     return {"data": folder / "cycles.zarr", "models": folder / "models"}
@@ -47,7 +47,9 @@ def shared(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_the_smoke_preset_writes_numbers_and_a_picture(name, tmp_path, shared):
+def test_the_smoke_preset_writes_numbers_and_a_picture(
+    name: str, tmp_path: Path, shared: dict[str, Path]
+) -> None:
     needs = inspect.signature(importlib.import_module(f"experiments.{name}").run).parameters
     places = [[f"--{what}", str(place)] for what, place in shared.items() if what in needs]
     subprocess.run(
@@ -66,13 +68,15 @@ def test_the_smoke_preset_writes_numbers_and_a_picture(name, tmp_path, shared):
     assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_has_a_result_and_what_has_not_is_known():
+def test_what_has_a_result_and_what_has_not_is_known() -> None:
     committed = {path.stem for path in (ROOT / "experiments" / "results").glob("*.json")}
     assert committed & set(NAMES) == set(NAMES) - NOT_RUN
 
 
 @pytest.mark.parametrize("name", sorted(set(NAMES) - NOT_RUN))
-def test_committed_results_are_of_the_full_preset_and_can_be_drawn(name, tmp_path):
+def test_committed_results_are_of_the_full_preset_and_can_be_drawn(
+    name: str, tmp_path: Path
+) -> None:
     path = ROOT / "experiments" / "results" / f"{name}.json"
     result = json.loads(path.read_text())
     assert result["preset"] == "full"
@@ -84,7 +88,7 @@ def test_committed_results_are_of_the_full_preset_and_can_be_drawn(name, tmp_pat
 # --- What the figures rest on.
 
 
-def test_partial_rank_correlations_see_through_a_confounder():
+def test_partial_rank_correlations_see_through_a_confounder() -> None:
     random = np.random.default_rng(0)
     columns = random.normal(size=(4000, 13))
     # The second characteristic only goes with the first; the outcomes with the first alone.
@@ -98,7 +102,7 @@ def test_partial_rank_correlations_see_through_a_confounder():
 
 
 @pytest.mark.parametrize("name", action_landscape.SHAPES)
-def test_the_shapes_have_the_characteristics_they_are_named_for(name):
+def test_the_shapes_have_the_characteristics_they_are_named_for(name: str) -> None:
     slope, incidence, *curvatures = action_landscape.SHAPES[name]
     height = action_landscape.surface(slope, incidence, *curvatures)
     local = LocalHeightmap(jnp.asarray(height[10:46, 8:44], jnp.float32), 0.1, 0.0)
@@ -108,7 +112,7 @@ def test_the_shapes_have_the_characteristics_they_are_named_for(name):
         np.testing.assert_allclose(found[2:], curvatures, atol=0.01)
 
 
-def test_the_summary_of_gradients_can_fail():
+def test_the_summary_of_gradients_can_fail() -> None:
     random = np.random.default_rng(1)
     central = random.normal(size=(50, 4))
     same = simulator_gradients._summary(central, central)
@@ -123,7 +127,9 @@ def test_the_summary_of_gradients_can_fail():
     assert some["median"] == pytest.approx(1.0)
 
 
-def test_what_is_no_data_set_is_said_in_one_line(tmp_path, monkeypatch, capsys):
+def test_what_is_no_data_set_is_said_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "note.txt").write_text("keep me")
     arguments = ["--data", str(tmp_path / "note.txt"), "--out", str(tmp_path / "results")]
     monkeypatch.setattr(sys, "argv", ["dataset_overview", *arguments])

@@ -1,6 +1,7 @@
 """What the experiments on trained models compute: floors, sums of errors, cosines, kept models."""
 
 import dataclasses
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,19 +20,22 @@ from experiments._common.models import load_or_train as trained
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import fingerprint
 from wlplan.training import PsiLowSettings
-from wlplan.types import Performance
+from wlplan.types import Action, Performance, Pile, Pose
 
 # --- models that are kept
 
 
-def breaks(*_, **__):
+def breaks(*_: object, **__: object) -> None:
     raise ZeroDivisionError
 
 
-def test_a_model_is_trained_once_and_found_again(tmp_path, monkeypatch):
+def test_a_model_is_trained_once_and_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = synthetic(rollouts=10, loads=6)
     settings = PsiLowSettings(activation="swish", epochs=1, hidden=(4,))
     first, seconds = trained(tmp_path, data, settings)
+    assert seconds is not None
     assert seconds > 0.0
     with monkeypatch.context() as patched:
         patched.setattr("wlplan.training.train", breaks)
@@ -48,7 +52,7 @@ def test_a_model_is_trained_once_and_found_again(tmp_path, monkeypatch):
     assert sum(fingerprint(data)[7:15] in name for name in names) == 2
 
 
-def test_another_default_is_another_model(tmp_path, monkeypatch):
+def test_another_default_is_another_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = synthetic(rollouts=10, loads=6)
 
     @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,7 +67,9 @@ def test_another_default_is_another_model(tmp_path, monkeypatch):
     assert len([path for path in tmp_path.iterdir() if path.is_dir()]) == 2
 
 
-def test_a_training_that_was_cut_short_has_no_time(tmp_path, monkeypatch):
+def test_a_training_that_was_cut_short_has_no_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = synthetic(rollouts=10, loads=6)
     settings = PsiLowSettings(epochs=1, hidden=(4,))
     with monkeypatch.context() as patched:
@@ -76,7 +82,7 @@ def test_a_training_that_was_cut_short_has_no_time(tmp_path, monkeypatch):
 # --- learning curve
 
 
-def test_parts_of_the_learning_curve_are_drawn_without_repetition():
+def test_parts_of_the_learning_curve_are_drawn_without_repetition() -> None:
     pool = synthetic(rollouts=30, loads=10)
     part, epochs = learning_curve._part(pool, 90, seed=0)
     assert len(part) == 100
@@ -92,7 +98,7 @@ def test_parts_of_the_learning_curve_are_drawn_without_repetition():
 # --- noise floor
 
 
-def test_the_floor_is_the_mean_deviation_of_what_cannot_be_told_apart():
+def test_the_floor_is_the_mean_deviation_of_what_cannot_be_told_apart() -> None:
     random = np.random.default_rng(0)
     mean = random.uniform(2.0, 4.0, (2000, 1, 3))
     spread = np.array([0.0, 0.01, 0.05])
@@ -100,14 +106,14 @@ def test_the_floor_is_the_mean_deviation_of_what_cannot_be_told_apart():
     np.testing.assert_allclose(found, np.sqrt(2.0 / np.pi) * spread, rtol=0.03, atol=1e-12)
 
 
-def test_a_better_constant_lowers_the_floor():
+def test_a_better_constant_lowers_the_floor() -> None:
     # Three repeats of four agree: that value is the best, and errs on the fourth alone.
     repeats = np.full((1, 4, 3), 2.0)
     repeats[0, 3] = 4.0
     np.testing.assert_allclose(noise_floor.floor(repeats), (0.5 / 4.0) * np.sqrt(4.0 / 3.0))
 
 
-def test_changes_around_the_map_leave_the_map_and_the_ground_alone():
+def test_changes_around_the_map_leave_the_map_and_the_ground_alone() -> None:
     slope = np.maximum(0.5 * (np.arange(52) * CELL_SIZE - 1.0), 0.0)
     surface = np.broadcast_to(slope[None, :, None], (2, 52, 52))
     changed = noise_floor.around(surface, 3, np.random.default_rng(0))
@@ -128,13 +134,13 @@ class TakesOne:
 
     factor: float
 
-    def __call__(self, pile, pose, action):
+    def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         """The pose scaled as mass, time and work."""
         told = Performance(self.factor * pose.x, self.factor * pose.y, self.factor * pose.heading)
         return pile.replace(height=pile.height - 0.1 * self.factor), told
 
 
-def sequence(loads=4, cells=5):
+def sequence(loads: int = 4, cells: int = 5) -> sequential_loading.Sequence:
     random = np.random.default_rng(0)
     outcomes = random.uniform(1.0, 2.0, (loads, 3))
     steps = 0.1 * np.arange(loads + 1)
@@ -149,7 +155,7 @@ def sequence(loads=4, cells=5):
 
 
 @pytest.mark.parametrize("own_pile", [True, False])
-def test_the_right_world_has_no_error(own_pile):
+def test_the_right_world_has_no_error(own_pile: bool) -> None:
     played = sequence()
     found = sequential_loading.predicted(TakesOne(1.0), played, own_pile=own_pile)
     np.testing.assert_allclose(found[0], played.outcomes, rtol=1e-6)
@@ -157,7 +163,7 @@ def test_the_right_world_has_no_error(own_pile):
     np.testing.assert_allclose(found[2], 0.0, atol=1e-5)
 
 
-def test_errors_of_a_wrong_world_add_up():
+def test_errors_of_a_wrong_world_add_up() -> None:
     played = sequence()
     found = sequential_loading.predicted(TakesOne(1.2), played, own_pile=True)
     truth = played.outcomes[None]
@@ -174,7 +180,7 @@ def test_errors_of_a_wrong_world_add_up():
     assert sequential_loading._sizes([found], truth)["work"] == pytest.approx(0.2, rel=1e-4)
 
 
-def test_errors_that_cancel_in_the_sum_still_have_a_size():
+def test_errors_that_cancel_in_the_sum_still_have_a_size() -> None:
     played = sequence()
     wrong = played.outcomes + np.array([0.1, -0.1, 0.1, -0.1])[:, None]
     found = (wrong, played.volumes[1:], np.zeros(4))
@@ -186,7 +192,7 @@ def test_errors_that_cancel_in_the_sum_still_have_a_size():
 # --- gradients
 
 
-def test_the_summary_of_cosines_counts_what_points_nowhere():
+def test_the_summary_of_cosines_counts_what_points_nowhere() -> None:
     random = np.random.default_rng(0)
     truth = random.normal(size=(100, 4))
     same = model_gradients.summary(2.0 * truth, truth)
@@ -203,7 +209,7 @@ def test_the_summary_of_cosines_counts_what_points_nowhere():
     assert some["p10"] == pytest.approx(-1.0)
 
 
-def test_derivatives_are_turned_into_the_frame_of_the_pose():
+def test_derivatives_are_turned_into_the_frame_of_the_pose() -> None:
     """Of f = 2 ahead + 3 aside, at a pose that looks along 30 degrees."""
     heading = np.radians(30.0)
     ahead, aside = (np.cos(heading), np.sin(heading)), (-np.sin(heading), np.cos(heading))
@@ -219,7 +225,7 @@ def test_derivatives_are_turned_into_the_frame_of_the_pose():
 # --- reliability
 
 
-def test_deviations_that_are_right_cover_as_they_say_and_others_do_not():
+def test_deviations_that_are_right_cover_as_they_say_and_others_do_not() -> None:
     random = np.random.default_rng(0)
     deviation = random.uniform(0.1, 2.0, 20_000)
     error = deviation * random.normal(size=len(deviation))

@@ -2,14 +2,19 @@
 
 import errno
 import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 
 from wlplan.io import files
 from wlplan.io.files import atomic_folder
 
+Existing = Literal["refuse", "replace", "add"]
 
-def contents(folder):
+
+def contents(folder: Path) -> dict[str, str | None]:
     """What every file below a folder holds, hidden ones too; of a folder None."""
     return {
         path.relative_to(folder).as_posix(): path.read_text() if path.is_file() else None
@@ -17,40 +22,40 @@ def contents(folder):
     }
 
 
-def fill(folder, word):
+def fill(folder: Path, word: str) -> None:
     """Writes a file, and one in a folder."""
     (folder / "a.txt").write_text(word)
     (folder / "sub").mkdir()
     (folder / "sub" / "b.txt").write_text(word)
 
 
-def make(path, *, then=lambda: None, **options):
+def make(path: Path, *, then: Callable[[], None] = lambda: None, **options: Any) -> None:
     """Writes a folder as `fill` does; `then` is called before the block ends."""
     with atomic_folder(path, **options) as temporary:
         fill(temporary, "new")
         then()
 
 
-def raiser(error):
+def raiser(error: type[BaseException]) -> Callable[[], None]:
     """A function that raises."""
 
-    def fail():
+    def fail() -> None:
         raise error
 
     return fail
 
 
-def filled(word):
+def filled(word: str) -> dict[str, str | None]:
     return {"a.txt": word, "sub": None, "sub/b.txt": word}
 
 
-def below(name, entries):
+def below(name: str, entries: Mapping[str, str | None]) -> dict[str, str | None]:
     """`entries` as `contents` has them one folder further up."""
     return {name: None} | {f"{name}/{key}": value for key, value in entries.items()}
 
 
 @pytest.fixture
-def target(tmp_path):
+def target(tmp_path: Path) -> Path:
     """A folder with files of its own."""
     folder = tmp_path / "out"
     folder.mkdir()
@@ -64,11 +69,16 @@ EXISTING = ("refuse", "replace", "add")
 FAILURES = (KeyboardInterrupt, SystemExit, OSError, ValueError)
 
 
-def failing(monkeypatch, which, error=KeyboardInterrupt, after=False):
+def failing(
+    monkeypatch: pytest.MonkeyPatch,
+    which: int,
+    error: type[BaseException] = KeyboardInterrupt,
+    after: bool = False,
+) -> None:
     """Has the call number `which` to `os.replace` fail: before it is done, or right after."""
     real, calls = os.replace, []
 
-    def replace(source, goal):
+    def replace(source: Path, goal: Path) -> None:
         calls.append(goal)
         if len(calls) != which:
             return real(source, goal)
@@ -76,14 +86,14 @@ def failing(monkeypatch, which, error=KeyboardInterrupt, after=False):
             real(source, goal)
         raise error
 
-    monkeypatch.setattr(files.os, "replace", replace)
+    monkeypatch.setattr(os, "replace", replace)
 
 
 # --- where nothing is
 
 
 @pytest.mark.parametrize("existing", EXISTING)
-def test_a_new_folder_appears_as_a_whole(tmp_path, existing):
+def test_a_new_folder_appears_as_a_whole(tmp_path: Path, existing: Existing) -> None:
     path = tmp_path / "not" / "yet" / "out"
     with atomic_folder(path, existing=existing) as temporary:
         fill(temporary, "new")
@@ -94,7 +104,7 @@ def test_a_new_folder_appears_as_a_whole(tmp_path, existing):
 
 
 @pytest.mark.parametrize("existing", EXISTING)
-def test_an_empty_folder_is_filled(tmp_path, existing):
+def test_an_empty_folder_is_filled(tmp_path: Path, existing: Existing) -> None:
     with atomic_folder(tmp_path, existing=existing) as temporary:
         fill(temporary, "new")
     assert contents(tmp_path) == filled("new")
@@ -102,14 +112,16 @@ def test_an_empty_folder_is_filled(tmp_path, existing):
 
 @pytest.mark.parametrize("existing", EXISTING)
 @pytest.mark.parametrize("failure", FAILURES)
-def test_what_fails_leaves_nothing(tmp_path, existing, failure):
+def test_what_fails_leaves_nothing(
+    tmp_path: Path, existing: Existing, failure: type[BaseException]
+) -> None:
     with pytest.raises(failure):
         make(tmp_path / "not" / "yet", existing=existing, then=raiser(failure))
     assert contents(tmp_path) == {}
 
 
-def test_a_folder_above_that_somebody_else_uses_stays(tmp_path):
-    def fail():
+def test_a_folder_above_that_somebody_else_uses_stays(tmp_path: Path) -> None:
+    def fail() -> None:
         (tmp_path / "not" / "theirs.txt").write_text("theirs")
         raise KeyboardInterrupt
 
@@ -119,10 +131,10 @@ def test_a_folder_above_that_somebody_else_uses_stays(tmp_path):
 
 
 @pytest.mark.parametrize("existing", ["refuse", "add"])
-def test_what_appears_meanwhile_is_not_overwritten(tmp_path, existing):
+def test_what_appears_meanwhile_is_not_overwritten(tmp_path: Path, existing: Existing) -> None:
     path = tmp_path / "out"
 
-    def appear():
+    def appear() -> None:
         path.mkdir()
         (path / "theirs.txt").write_text("theirs")
 
@@ -135,7 +147,7 @@ def test_what_appears_meanwhile_is_not_overwritten(tmp_path, existing):
 
 
 @pytest.mark.parametrize("existing", EXISTING)
-def test_a_file_is_no_folder(tmp_path, existing):
+def test_a_file_is_no_folder(tmp_path: Path, existing: Existing) -> None:
     (tmp_path / "file").write_text("old")
     begun = raiser(AssertionError)
     with pytest.raises(FileExistsError):
@@ -147,21 +159,23 @@ def test_a_file_is_no_folder(tmp_path, existing):
 
 @pytest.mark.parametrize("existing", ["replace", "add"])
 @pytest.mark.parametrize("failure", FAILURES)
-def test_what_fails_leaves_what_was_there(target, existing, failure):
+def test_what_fails_leaves_what_was_there(
+    target: Path, existing: Existing, failure: type[BaseException]
+) -> None:
     before = contents(target.parent)
     with pytest.raises(failure):
         make(target, existing=existing, then=raiser(failure))
     assert contents(target.parent) == before
 
 
-def test_a_folder_with_something_in_it_is_refused_before_anything_is_done(target):
+def test_a_folder_with_something_in_it_is_refused_before_anything_is_done(target: Path) -> None:
     before = contents(target.parent)
     with pytest.raises(FileExistsError):
         make(target, then=raiser(AssertionError))
     assert contents(target.parent) == before
 
 
-def test_a_folder_is_replaced_with_all_it_holds(target):
+def test_a_folder_is_replaced_with_all_it_holds(target: Path) -> None:
     with atomic_folder(target, existing="replace") as new:
         fill(new, "new")
         assert contents(target) == OLD
@@ -171,14 +185,20 @@ def test_a_folder_is_replaced_with_all_it_holds(target):
 @pytest.mark.parametrize("which", [1, 2])
 @pytest.mark.parametrize("after", [False, True])
 @pytest.mark.parametrize("failure", FAILURES)
-def test_a_replacement_that_fails_restores_the_old(target, monkeypatch, which, after, failure):
+def test_a_replacement_that_fails_restores_the_old(
+    target: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    which: int,
+    after: bool,
+    failure: type[BaseException],
+) -> None:
     failing(monkeypatch, which, failure, after)
     with pytest.raises(failure):
         make(target, existing="replace")
     assert contents(target.parent) == below("out", OLD)
 
 
-def test_files_are_added_to_those_that_are_there(target):
+def test_files_are_added_to_those_that_are_there(target: Path) -> None:
     inode = target.stat().st_ino
     with atomic_folder(target, existing="add") as new:
         fill(new, "new")
@@ -190,17 +210,19 @@ def test_files_are_added_to_those_that_are_there(target):
 @pytest.mark.parametrize("links", [True, False])
 @pytest.mark.parametrize("after", [False, True])
 @pytest.mark.parametrize("which", range(1, 5))
-def test_files_that_cannot_all_be_added_are_not_added(target, monkeypatch, which, after, links):
+def test_files_that_cannot_all_be_added_are_not_added(
+    target: Path, monkeypatch: pytest.MonkeyPatch, which: int, after: bool, links: bool
+) -> None:
     """Both over files that are there and to new names, and without links by further moves."""
     if not links:
 
-        def no_links(*_, **__):
+        def no_links(*_: object, **__: object) -> None:
             raise OSError(errno.EPERM, "no links here")
 
-        monkeypatch.setattr(files.os, "link", no_links)
+        monkeypatch.setattr(os, "link", no_links)
     failing(monkeypatch, which, after=after)
 
-    def add():
+    def add() -> None:
         with atomic_folder(target, existing="add") as new:
             for name in ("a.txt", "b.txt", "c.txt", "other.txt"):
                 (new / name).write_text("new")
@@ -213,7 +235,7 @@ def test_files_that_cannot_all_be_added_are_not_added(target, monkeypatch, which
     assert contents(target) == OLD | names
 
 
-def test_a_folder_is_not_overwritten_by_a_file(target):
+def test_a_folder_is_not_overwritten_by_a_file(target: Path) -> None:
     (target / "sub").mkdir()
     (target / "sub" / "theirs.txt").write_text("theirs")
     before = contents(target)
@@ -223,7 +245,7 @@ def test_a_folder_is_not_overwritten_by_a_file(target):
 
 
 @pytest.mark.parametrize("existing", ["replace", "add"])
-def test_a_link_to_a_folder_means_that_folder(target, existing):
+def test_a_link_to_a_folder_means_that_folder(target: Path, existing: Existing) -> None:
     link = target.with_name("link")
     link.symlink_to(target)
     with atomic_folder(link, existing=existing) as new:
@@ -233,7 +255,9 @@ def test_a_link_to_a_folder_means_that_folder(target, existing):
     assert sorted(entry.name for entry in target.parent.iterdir()) == ["link", "out"]
 
 
-def test_the_working_directory_can_be_written_to(target, monkeypatch):
+def test_the_working_directory_can_be_written_to(
+    target: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(target)
     with atomic_folder(".", existing="add") as new:
         (new / "b.txt").write_text("new")
@@ -243,7 +267,7 @@ def test_the_working_directory_can_be_written_to(target, monkeypatch):
 # --- what killed processes left
 
 
-def test_leftovers_are_removed_under_a_lock_only_and_nothing_like_them(tmp_path):
+def test_leftovers_are_removed_under_a_lock_only_and_nothing_like_them(tmp_path: Path) -> None:
     path = tmp_path / "out"
     left = tmp_path / ".out.0123456789ab.tmp"
     others = (".other.0123456789ab.tmp", ".out.notes.tmp", ".out.0123456789ab.old", "out.tmp")
@@ -259,7 +283,7 @@ def test_leftovers_are_removed_under_a_lock_only_and_nothing_like_them(tmp_path)
     assert contents(path) == filled("second")
 
 
-def test_a_name_with_special_characters_is_no_pattern(tmp_path):
+def test_a_name_with_special_characters_is_no_pattern(tmp_path: Path) -> None:
     (tmp_path / ".out.0123456789ab.tmp").mkdir()
     with atomic_folder(tmp_path / "o*t", locked=True) as new:
         fill(new, "new")
@@ -270,7 +294,9 @@ def test_a_name_with_special_characters_is_no_pattern(tmp_path):
 
 
 @pytest.mark.parametrize("failure", FAILURES)
-def test_a_file_that_cannot_be_replaced_is_as_it_was(target, monkeypatch, failure):
+def test_a_file_that_cannot_be_replaced_is_as_it_was(
+    target: Path, monkeypatch: pytest.MonkeyPatch, failure: type[BaseException]
+) -> None:
     failing(monkeypatch, 1, failure)
     with pytest.raises(failure):
         files.replace_file(target / "a.txt", b"new")

@@ -2,6 +2,8 @@
 
 import json
 import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,16 +18,24 @@ from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
 from wlplan.planning.job import make_job
 from wlplan.studies import gradcheck
-from wlplan.studies.gradcheck import COMPONENTS, as_table, check_gradient, plan_from, random_plan
+from wlplan.studies.gradcheck import (
+    COMPONENTS,
+    Component,
+    GradientCheck,
+    as_table,
+    check_gradient,
+    plan_from,
+    random_plan,
+)
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import toe_contour
-from wlplan.types import Performance
+from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 from wlplan.worlds import library as worlds
 from wlplan.worlds.capabilities import with_derivatives
 
 
 @jax.custom_vjp
-def misled(x, factor):
+def misled(x: jax.Array, factor: jax.Array) -> jax.Array:
     """The identity, whose cotangent is too long by a factor."""
     return x
 
@@ -42,7 +52,7 @@ class SmoothWorld(struct.PyTreeNode):
     ripple: Any = math.inf  # k_bm at which the time has an inflection in a short wave
     noise: Any = 0.0  # size of a term that rounds [s]
 
-    def __call__(self, pile, pose, action):
+    def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         """The pile, shrunk, and what was taken."""
         part = 0.05 + 0.02 * jnp.sin(pose.x + 2.0 * pose.y) * action.delta_bm
         after = pile.replace(height=pile.height * (1.0 - part))
@@ -58,15 +68,17 @@ class SmoothWorld(struct.PyTreeNode):
 
 
 @pytest.fixture(scope="module")
-def pile():
+def pile() -> Pile:
     return seed_pile("conical", slope=math.radians(30.0), height=1.5, noise=0.0)
 
 
 @pytest.fixture(scope="module")
-def check(pile):
+def check(pile: Pile) -> Callable[..., GradientCheck]:
     """Compare a plan of two loads in the world with the given flaws."""
 
-    def run(plan=None, step=gradcheck.STEP, **flaws):
+    def run(
+        plan: LoadingPlan | None = None, step: float = gradcheck.STEP, **flaws: float
+    ) -> GradientCheck:
         job = make_job(SmoothWorld(**flaws), pile)
         plan = random_plan(pile, 2, seed=0) if plan is None else plan
         return check_gradient(job, plan, step=step)
@@ -75,18 +87,18 @@ def check(pile):
 
 
 @pytest.fixture(scope="module")
-def k_bm(pile):
+def k_bm(pile: Pile) -> float:
     return float(random_plan(pile, 2, seed=0).action.k_bm[0])
 
 
-def named(components):
+def named(components: Iterable[Component]) -> list[tuple[int, str]]:
     return [(c.load, c.component) for c in components]
 
 
 # --- the plan
 
 
-def test_a_random_plan_lies_on_the_toe_and_inside_the_box(pile):
+def test_a_random_plan_lies_on_the_toe_and_inside_the_box(pile: Pile) -> None:
     plan = random_plan(pile, 5, seed=3)
     points = np.stack([plan.pose.x, plan.pose.y], axis=-1)
     toe = toe_contour(pile).points
@@ -101,7 +113,7 @@ def test_a_random_plan_lies_on_the_toe_and_inside_the_box(pile):
     assert np.abs(other - same).max() > 0.1
 
 
-def test_tables_and_plans_are_inverse():
+def test_tables_and_plans_are_inverse() -> None:
     table = np.random.default_rng(0).normal(size=(3, 4, 7)).astype(np.float32)
     plan = plan_from(table)
     np.testing.assert_array_equal(as_table(plan), table)
@@ -110,7 +122,7 @@ def test_tables_and_plans_are_inverse():
         np.testing.assert_array_equal(getattr(part, name), table[..., k])
 
 
-def test_a_plan_that_cannot_be_made_is_refused(pile):
+def test_a_plan_that_cannot_be_made_is_refused(pile: Pile) -> None:
     with pytest.raises(InputError, match="at least 1"):
         random_plan(pile, 0, seed=0)
     with pytest.raises(InputError, match="Nothing to dig"):
@@ -122,7 +134,7 @@ def test_a_plan_that_cannot_be_made_is_refused(pile):
 # --- the verdicts
 
 
-def test_a_right_gradient_passes(check):
+def test_a_right_gradient_passes(check: Callable[..., GradientCheck]) -> None:
     found = check()
     assert named(found.components) == [(n, name) for n in (1, 2) for name in COMPONENTS]
     assert {c.verdict for c in found.components} == {"ok"}
@@ -131,7 +143,9 @@ def test_a_right_gradient_passes(check):
     assert max(abs(c.reverse) for c in found.components) > 0.01
 
 
-def test_a_gradient_that_is_a_thousandth_too_long_is_wrong(check):
+def test_a_gradient_that_is_a_thousandth_too_long_is_wrong(
+    check: Callable[..., GradientCheck],
+) -> None:
     found = check(error=1e-3)
     assert named(found.with_verdict("wrong")) == [(1, "k_bm"), (2, "k_bm")]
     assert found.largest_error == pytest.approx(1e-3, rel=0.01)
@@ -139,7 +153,9 @@ def test_a_gradient_that_is_a_thousandth_too_long_is_wrong(check):
 
 
 @pytest.mark.parametrize("ahead", [3e-8, 3e-7, -3e-7])
-def test_a_kink_is_named_and_not_called_wrong(check, k_bm, ahead):
+def test_a_kink_is_named_and_not_called_wrong(
+    check: Callable[..., GradientCheck], k_bm: float, ahead: float
+) -> None:
     found = check(kink=k_bm + ahead)
     assert named(found.with_verdict("kink")) == [(1, "k_bm")]
     assert found.with_verdict("wrong") == []
@@ -148,13 +164,17 @@ def test_a_kink_is_named_and_not_called_wrong(check, k_bm, ahead):
     assert found.largest_error < 1e-6
 
 
-def test_a_kink_does_not_excuse_a_wrong_gradient(check, k_bm):
+def test_a_kink_does_not_excuse_a_wrong_gradient(
+    check: Callable[..., GradientCheck], k_bm: float
+) -> None:
     """The narrower difference, which has no kink in it, is off too."""
     found = check(kink=k_bm + 9e-7, error=1e-2)
     assert (1, "k_bm") in named(found.with_verdict("wrong"))
 
 
-def test_curvature_does_not_excuse_a_wrong_gradient(check, pile):
+def test_curvature_does_not_excuse_a_wrong_gradient(
+    check: Callable[..., GradientCheck], pile: Pile
+) -> None:
     """Where the slope is small against the curvature, one-sided differences disagree as well."""
     table = np.array(as_table(random_plan(pile, 1, seed=0)))
     table[0, 4] = 1e-4
@@ -163,19 +183,21 @@ def test_curvature_does_not_excuse_a_wrong_gradient(check, pile):
     assert {c.verdict for c in check(plan_from(table), curvature=5e3).components} == {"ok"}
 
 
-def test_a_step_that_is_too_wide_is_not_called_wrong(check, k_bm):
+def test_a_step_that_is_too_wide_is_not_called_wrong(
+    check: Callable[..., GradientCheck], k_bm: float
+) -> None:
     found = check(ripple=k_bm, step=1e-4)
     assert {c.verdict for c in found.components} == {"ok"}
     assert found.components[4].step == pytest.approx(1e-5)
 
 
-def test_rounding_is_not_called_wrong(check):
+def test_rounding_is_not_called_wrong(check: Callable[..., GradientCheck]) -> None:
     found = check(noise=1e7)
     assert found.with_verdict("wrong") == []
     assert any(c.step > found.step for c in found.components)
 
 
-def test_a_gradient_that_is_not_finite_is_wrong(check):
+def test_a_gradient_that_is_not_finite_is_wrong(check: Callable[..., GradientCheck]) -> None:
     found = check(error=math.nan)
     assert named(found.with_verdict("wrong")) == [(1, "k_bm"), (2, "k_bm")]
     text = json.dumps(found.as_dict(), allow_nan=False)
@@ -183,7 +205,7 @@ def test_a_gradient_that_is_not_finite_is_wrong(check):
     assert json.loads(text)["largest_relative_error"] is None
 
 
-def test_it_refuses_what_makes_no_sense(check, pile):
+def test_it_refuses_what_makes_no_sense(check: Callable[..., GradientCheck], pile: Pile) -> None:
     job = make_job(SmoothWorld(), pile)
     plan = random_plan(pile, 1, seed=0)
     with pytest.raises(InputError, match="step"):
@@ -194,7 +216,7 @@ def test_it_refuses_what_makes_no_sense(check, pile):
         check(noise=math.nan)
 
 
-def test_progress_reaches_the_end(pile):
+def test_progress_reaches_the_end(pile: Pile) -> None:
     job = make_job(SmoothWorld(error=0.1), pile)
     told = []
     check_gradient(job, random_plan(pile, 2, seed=0), progress=lambda *both: told.append(both))
@@ -203,8 +225,10 @@ def test_progress_reaches_the_end(pile):
     assert told[-1] == (18, 18)
 
 
-def test_the_simulator_gets_its_derivatives():
-    assert with_derivatives(Simulator()).settings.differentiable
+def test_the_simulator_gets_its_derivatives() -> None:
+    found = with_derivatives(Simulator())
+    assert isinstance(found, Simulator)
+    assert found.settings.differentiable
     world = SmoothWorld()
     assert with_derivatives(world) is world
 
@@ -213,17 +237,19 @@ def test_the_simulator_gets_its_derivatives():
 
 
 @pytest.fixture
-def scan(tmp_path, pile):
+def scan(tmp_path: Path, pile: Pile) -> str:
     path = tmp_path / "scan.npz"
     io.write_pile(path, pile)
     return str(path)
 
 
 @pytest.fixture
-def command(capsys, monkeypatch, scan):
+def command(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, scan: str
+) -> Callable[..., tuple[int, str, str]]:
     """Run `wlplan gradcheck` on a small pile; with flaws, in a world that has them."""
 
-    def run(*words, **flaws):
+    def run(*words: object, **flaws: float) -> tuple[int, str, str]:
         if flaws:
             monkeypatch.setattr(worlds, "load_world", lambda name, **_: SmoothWorld(**flaws))
         capsys.readouterr()
@@ -233,7 +259,9 @@ def command(capsys, monkeypatch, scan):
     return run
 
 
-def test_the_command_passes_the_world_that_ships(command, tmp_path):
+def test_the_command_passes_the_world_that_ships(
+    command: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
     code, out, err = command("--loads", 2, "--out", tmp_path / "out")
     assert code == 0
     assert "WRONG" not in out
@@ -247,7 +275,7 @@ def test_the_command_passes_the_world_that_ships(command, tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["gradcheck.json"]
 
 
-def test_a_wrong_gradient_ends_with_code_1(command):
+def test_a_wrong_gradient_ends_with_code_1(command: Callable[..., tuple[int, str, str]]) -> None:
     code, out, _ = command("--loads", 2, error=1e-3)
     assert code == 1
     assert "WRONG: load 1 k_bm, load 2 k_bm" in out
@@ -255,14 +283,18 @@ def test_a_wrong_gradient_ends_with_code_1(command):
     assert command("--loads", 2, "--tolerance", 0.01, error=1e-3)[0] == 0
 
 
-def test_a_kink_is_named_and_ends_with_code_0(command, k_bm):
+def test_a_kink_is_named_and_ends_with_code_0(
+    command: Callable[..., tuple[int, str, str]], k_bm: float
+) -> None:
     code, out, _ = command("--loads", 2, kink=k_bm + 3e-7)
     assert code == 0
     assert "at kinks: load 1 k_bm" in out
     assert "WRONG" not in out
 
 
-def test_json_holds_every_component_and_nothing_else(command, tmp_path):
+def test_json_holds_every_component_and_nothing_else(
+    command: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
     options = ("--loads", 2, "--seed", 4, "--objective", "productivity", "--step", 2e-6)
     code, out, _ = command(*options, "--json", "--out", tmp_path / "out", error=1e-3)
     assert code == 1
@@ -282,11 +314,13 @@ def test_json_holds_every_component_and_nothing_else(command, tmp_path):
     assert len(document["loads"]) == 2
 
 
-def test_the_command_and_the_module_agree():
+def test_the_command_and_the_module_agree() -> None:
     """The command repeats these to keep help fast."""
     defaults = {option.name: option for option in cli.wlplan.commands["gradcheck"].params}
     assert defaults["step"].default == gradcheck.STEP
-    help_text = defaults["tolerance"].help.replace("e-0", "e-")
+    help_text = defaults["tolerance"].help
+    assert help_text is not None
+    help_text = help_text.replace("e-0", "e-")
     for tolerance in (gradcheck.TOLERANCE, gradcheck.SIMULATOR_TOLERANCE):
         assert f"{tolerance:.0e}".replace("e-0", "e-") in help_text
 
@@ -307,7 +341,9 @@ def test_the_command_and_the_module_agree():
         (["more.npz"], "more.npz"),
     ],
 )
-def test_bad_usage_is_one_line(command, words, told):
+def test_bad_usage_is_one_line(
+    command: Callable[..., tuple[int, str, str]], words: list[str], told: str
+) -> None:
     code, out, err = command(*words)
     assert (code, out) == (2, "")
     assert err.startswith("error: ")
@@ -316,7 +352,7 @@ def test_bad_usage_is_one_line(command, words, told):
 
 
 @pytest.mark.slow
-def test_the_command_passes_the_simulator(command):
+def test_the_command_passes_the_simulator(command: Callable[..., tuple[int, str, str]]) -> None:
     code, out, _ = command("--loads", 1, "--world", "simulator")
     assert code == 0
     assert "7 components" in out

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.typing import DTypeLike
 from laws import assert_gradient
 
 from wlplan.terrain.heightmap import (
@@ -20,17 +21,26 @@ from wlplan.terrain.heightmap import (
 from wlplan.types import Pile, Pose
 
 
-def plane(ax, ay, b=0.3, shape=(80, 70), origin=(-3.0, -2.0), dtype=jnp.float32):
+def plane(
+    ax: float,
+    ay: float,
+    b: float = 0.3,
+    shape: tuple[int, int] = (80, 70),
+    origin: tuple[float, float] = (-3.0, -2.0),
+    dtype: DTypeLike = jnp.float32,
+) -> Pile:
     x = origin[0] + 0.1 * np.arange(shape[0])
     y = origin[1] + 0.1 * np.arange(shape[1])
     return Pile(jnp.asarray(ax * x[:, None] + ay * y[None, :] + b, dtype), 0.1, origin)
 
 
-def pose(x, y, heading, dtype=jnp.float32):
+def pose(x: float, y: float, heading: float, dtype: DTypeLike = jnp.float32) -> Pose:
     return Pose(*(jnp.asarray(v, dtype) for v in (x, y, heading)))
 
 
-def bumpy(shape=(120, 110), seed=0, dtype=jnp.float32):
+def bumpy(
+    shape: tuple[int, int] = (120, 110), seed: int = 0, dtype: DTypeLike = jnp.float32
+) -> Pile:
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(0.1 * np.arange(shape[0]), 0.1 * np.arange(shape[1]), indexing="ij")
     height = 1.0 + 0.1 * x
@@ -40,7 +50,7 @@ def bumpy(shape=(120, 110), seed=0, dtype=jnp.float32):
     return Pile(jnp.asarray(height, dtype), 0.1)
 
 
-def test_sampling_reproduces_a_plane_and_repeats_the_border():
+def test_sampling_reproduces_a_plane_and_repeats_the_border() -> None:
     pile = plane(0.3, -0.2)
     x, y = jnp.asarray([0.123, 2.77, -2.95]), jnp.asarray([1.01, -1.93, 4.0])
     np.testing.assert_allclose(sample(pile.height, pile, x, y), 0.3 * x - 0.2 * y + 0.3, atol=1e-5)
@@ -50,7 +60,7 @@ def test_sampling_reproduces_a_plane_and_repeats_the_border():
 
 @pytest.mark.parametrize(("cells", "displacement"), [(36, 0.0), (52, 1.0)])
 @pytest.mark.parametrize("heading", [0.0, 0.7, math.pi / 2, -2.5])
-def test_a_local_heightmap_of_a_plane(cells, displacement, heading):
+def test_a_local_heightmap_of_a_plane(cells: int, displacement: float, heading: float) -> None:
     pile = plane(0.3, -0.2)
     local = sample_local(pile, pose(0.6, 0.9, heading), cells=cells, displacement=displacement)
     along, left = local_axes(cells, displacement)
@@ -61,14 +71,14 @@ def test_a_local_heightmap_of_a_plane(cells, displacement, heading):
     np.testing.assert_allclose(np.asarray(local.height)[inside], expected[inside], atol=1e-5)
 
 
-def test_the_map_is_symmetric_about_the_bucket_centre_line():
+def test_the_map_is_symmetric_about_the_bucket_centre_line() -> None:
     _, left = local_axes(36, 0.0)
     np.testing.assert_allclose(left, -left[::-1])
     # 3.6 m leave half a metre either side of a 2.6 m bucket.
     assert left[-1] + 0.05 == pytest.approx(1.8)
 
 
-def test_frames_are_inverse_to_each_other():
+def test_frames_are_inverse_to_each_other() -> None:
     p = pose(1.2, -0.7, 2.1)
     along, left = jnp.asarray([0.3, 2.0]), jnp.asarray([-1.0, 0.4])
     back = to_local(p, *to_world(p, along, left))
@@ -79,7 +89,7 @@ def test_frames_are_inverse_to_each_other():
     assert (float(x), float(y)) == (0.0, 1.0)
 
 
-def test_sampling_is_differentiable_in_the_pose():
+def test_sampling_is_differentiable_in_the_pose() -> None:
     with jax.enable_x64(True):
         pile = bumpy(dtype=jnp.float64)
         weight = jnp.asarray(np.random.default_rng(0).normal(size=(36, 36)))
@@ -91,7 +101,7 @@ def test_sampling_is_differentiable_in_the_pose():
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.4, 1.9, -2.8])
-def test_writing_back_keeps_the_volume_of_losses_and_gains(heading):
+def test_writing_back_keeps_the_volume_of_losses_and_gains(heading: float) -> None:
     pile = bumpy()
     rng = np.random.default_rng(1)
     along, left = np.meshgrid(*local_axes(52, 1.0), indexing="ij")
@@ -106,7 +116,7 @@ def test_writing_back_keeps_the_volume_of_losses_and_gains(heading):
     )
 
 
-def test_writing_back_a_change_puts_it_where_it_belongs():
+def test_writing_back_a_change_puts_it_where_it_belongs() -> None:
     pile = Pile(jnp.ones((120, 110)), 0.1)
     p = pose(5.5, 5.2, 0.6)
     along, left = np.meshgrid(*local_axes(52, 1.0), indexing="ij")
@@ -117,7 +127,7 @@ def test_writing_back_a_change_puts_it_where_it_belongs():
     assert jnp.abs(seen - (1.0 + change)).max() < 0.01
 
 
-def test_writing_back_does_not_dig_below_the_floor():
+def test_writing_back_does_not_dig_below_the_floor() -> None:
     ground = jnp.full((120, 110), 0.9)
     pile = Pile(jnp.ones((120, 110)), 0.1, ground=ground)
     along, left = np.meshgrid(*local_axes(52, 1.0), indexing="ij")
@@ -128,7 +138,7 @@ def test_writing_back_does_not_dig_below_the_floor():
     assert lost == pytest.approx(-float(change.sum()), rel=1e-4)
 
 
-def test_take_meets_its_total_and_respects_what_is_there():
+def test_take_meets_its_total_and_respects_what_is_there() -> None:
     rng = np.random.default_rng(0)
     wanted = jnp.asarray(rng.random((8, 8)), jnp.float32)
     available = jnp.asarray(0.6 * rng.random((8, 8)), jnp.float32)
@@ -140,7 +150,7 @@ def test_take_meets_its_total_and_respects_what_is_there():
     assert float(take(wanted, available, jnp.asarray(0.0)).sum()) == 0.0
 
 
-def test_cells_with_next_to_nothing_do_not_blow_up_the_gradient_of_take():
+def test_cells_with_next_to_nothing_do_not_blow_up_the_gradient_of_take() -> None:
     """All but a few cells are just used up; what those few hold is below the rounding."""
     rng = np.random.default_rng(0)
     weight = jnp.asarray(rng.normal(size=(6, 5)), jnp.float32)
@@ -156,7 +166,7 @@ def test_cells_with_next_to_nothing_do_not_blow_up_the_gradient_of_take():
             assert jnp.abs(part).max() < 10.0
 
 
-def test_take_is_differentiable():
+def test_take_is_differentiable() -> None:
     with jax.enable_x64(True):
         rng = np.random.default_rng(0)
         wanted, weight = jnp.asarray(rng.random((5, 5))), jnp.asarray(rng.normal(size=(5, 5)))

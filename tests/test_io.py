@@ -3,6 +3,9 @@
 import json
 import math
 import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,18 +17,21 @@ from wlplan import io
 from wlplan.errors import InputError
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import toe_contour
-from wlplan.types import Action, LoadingPlan, Performance, Pose
+from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
+
+# Spoils a document.
+Change = Callable[[dict[str, Any]], object]
 
 SLOPE = math.radians(30.0)
 
 
 @pytest.fixture
-def pile():
+def pile() -> Pile:
     return seed_pile("conical", slope=SLOPE, height=2.0, seed=1)
 
 
 @pytest.fixture
-def fields(pile):
+def fields(pile: Pile) -> dict[str, Any]:
     """What a valid .npz holds."""
     return {"height": np.asarray(pile.height), "cell_size": 0.1, "origin": np.asarray(pile.origin)}
 
@@ -33,9 +39,11 @@ def fields(pile):
 # --- the bundled pile
 
 
-def test_the_bundled_pile_is_read_with_its_ground():
+def test_the_bundled_pile_is_read_with_its_ground() -> None:
     pile = io.read_pile(io.bundled_pile_path())
     assert pile.cell_size == 0.1
+    assert pile.ground is not None
+    assert pile.valid is not None
     assert pile.height.shape == pile.ground.shape == pile.valid.shape == (190, 160)
     assert (pile.ground <= pile.height).all()
     assert 130.0 < volume(pile) < 200.0
@@ -44,7 +52,7 @@ def test_the_bundled_pile_is_read_with_its_ground():
     assert contour.accessible.sum() > 300
 
 
-def test_the_bundled_pile_ships_with_its_provenance():
+def test_the_bundled_pile_ships_with_its_provenance() -> None:
     page = io.bundled_pile_path().with_suffix(".md").read_text()
     assert "LeoRover/leo_simulator" in page
     assert "MIT" in page
@@ -53,7 +61,7 @@ def test_the_bundled_pile_ships_with_its_provenance():
 # --- npz
 
 
-def test_a_written_pile_reads_back_the_same(tmp_path, pile):
+def test_a_written_pile_reads_back_the_same(tmp_path: Path, pile: Pile) -> None:
     valid = np.ones(pile.height.shape, bool)
     valid[:5] = False
     pile = pile.replace(valid=jnp.asarray(valid), ground=pile.height * 0.1)
@@ -64,18 +72,20 @@ def test_a_written_pile_reads_back_the_same(tmp_path, pile):
     assert again.cell_size == pile.cell_size
 
 
-def test_level_ground_comes_out_as_zero(tmp_path, fields):
-    assert not io.read_pile(save(tmp_path / "pile.npz", fields)).ground.any()
+def test_level_ground_comes_out_as_zero(tmp_path: Path, fields: dict[str, Any]) -> None:
+    ground = io.read_pile(save(tmp_path / "pile.npz", fields)).ground
+    assert ground is not None
+    assert not ground.any()
 
 
-def test_a_map_without_a_pile_is_read(tmp_path, fields):
+def test_a_map_without_a_pile_is_read(tmp_path: Path, fields: dict[str, Any]) -> None:
     fields["height"] = np.zeros((60, 60))
     pile = io.read_pile(save(tmp_path / "pile.npz", fields))
     with pytest.raises(InputError, match="Nothing to dig"):
         toe_contour(pile)
 
 
-def test_a_map_of_another_spacing_is_resampled(tmp_path, fields):
+def test_a_map_of_another_spacing_is_resampled(tmp_path: Path, fields: dict[str, Any]) -> None:
     fields.update(cell_size=0.25, height=2.5 * fields["height"])
     pile = io.read_pile(save(tmp_path / "pile.npz", fields))
     assert pile.cell_size == 0.1
@@ -83,7 +93,9 @@ def test_a_map_of_another_spacing_is_resampled(tmp_path, fields):
     assert volume(pile) == pytest.approx(want, rel=0.01)
 
 
-def test_unseen_cells_may_hold_anything_and_are_filled(tmp_path, fields):
+def test_unseen_cells_may_hold_anything_and_are_filled(
+    tmp_path: Path, fields: dict[str, Any]
+) -> None:
     height = fields["height"]
     valid = np.ones(height.shape, bool)
     valid[20:24, 30:40] = valid[60, 60:62] = valid[5, 5] = False
@@ -98,37 +110,42 @@ def test_unseen_cells_may_hold_anything_and_are_filled(tmp_path, fields):
     np.testing.assert_allclose(pile.height, height, atol=0.7)
 
 
-def test_the_ground_of_the_file_is_used_unless_one_is_passed(tmp_path, fields):
+def test_the_ground_of_the_file_is_used_unless_one_is_passed(
+    tmp_path: Path, fields: dict[str, Any]
+) -> None:
     fields["ground"] = np.full(fields["height"].shape, -0.25)
     path = save(tmp_path / "pile.npz", fields)
     np.testing.assert_array_equal(io.read_pile(path).ground, -0.25)
     np.testing.assert_array_equal(io.read_pile(path, ground=-1.0).ground, -1.0)
     lower = fields["height"] - 0.5
-    np.testing.assert_allclose(io.read_pile(path, ground=lower).ground, lower, atol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(io.read_pile(path, ground=lower).ground), lower, atol=1e-6
+    )
     above = io.read_pile(path, ground=1.0)
+    assert above.ground is not None
     assert (above.ground <= above.height).all()
 
 
-def test_survey_coordinates_keep_their_last_digits(tmp_path, fields):
+def test_survey_coordinates_keep_their_last_digits(tmp_path: Path, fields: dict[str, Any]) -> None:
     fields["origin"] = np.array([431_012.25, 6_512_503.5])
     fields["height"] = fields["height"].astype(np.float64) + 1234.5
     fields["ground"] = np.full(fields["height"].shape, 1234.5)
     pile = io.read_pile(save(tmp_path / "pile.npz", fields))
     np.testing.assert_allclose(pile.origin, [12.25, 503.5])
     assert float(pile.height.min()) == pytest.approx(34.5)
-    np.testing.assert_allclose(pile.ground, 34.5)
+    np.testing.assert_allclose(np.asarray(pile.ground), 34.5)
 
 
-def without(name):
+def without(name: str) -> Change:
     return lambda fields: fields.pop(name)
 
 
-def setting(name, value):
+def setting(name: str, value: object) -> Change:
     return lambda fields: fields.update({name: value})
 
 
-def nan_in(name):
-    def change(fields):
+def nan_in(name: str) -> Change:
+    def change(fields: dict[str, Any]) -> None:
         fields[name] = fields.get(name, np.zeros(fields["height"].shape)).copy()
         fields[name][3, 4] = np.nan
 
@@ -172,23 +189,27 @@ def nan_in(name):
         (setting("origin", np.array(["a", "b"])), "`origin`"),
     ],
 )
-def test_bad_fields_are_refused(tmp_path, fields, change, match):
+def test_bad_fields_are_refused(
+    tmp_path: Path, fields: dict[str, Any], change: Change, match: str
+) -> None:
     change(fields)
     refused(save(tmp_path / "pile.npz", fields), match)
 
 
-def test_a_map_that_was_not_seen_is_refused(tmp_path, fields):
+def test_a_map_that_was_not_seen_is_refused(tmp_path: Path, fields: dict[str, Any]) -> None:
     fields["valid"] = np.zeros(fields["height"].shape, bool)
     refused(save(tmp_path / "pile.npz", fields), "no cell counts as seen")
 
 
-def test_valid_may_be_zeros_and_ones(tmp_path, fields):
+def test_valid_may_be_zeros_and_ones(tmp_path: Path, fields: dict[str, Any]) -> None:
     fields["valid"] = np.ones(fields["height"].shape, np.uint8)
     fields["valid"][0, 0] = 0
-    assert not io.read_pile(save(tmp_path / "pile.npz", fields)).valid[0, 0]
+    valid = io.read_pile(save(tmp_path / "pile.npz", fields)).valid
+    assert valid is not None
+    assert not valid[0, 0]
 
 
-def test_missing_files_folders_and_strange_names_are_refused(tmp_path):
+def test_missing_files_folders_and_strange_names_are_refused(tmp_path: Path) -> None:
     refused(tmp_path / "none.npz", "no such pile file")
     (tmp_path / "folder.npz").mkdir()
     refused(tmp_path / "folder.npz", "is a folder")
@@ -202,20 +223,22 @@ def test_missing_files_folders_and_strange_names_are_refused(tmp_path):
 
 
 @pytest.fixture
-def plan():
+def plan() -> LoadingPlan:
     pose = Pose(*(jnp.asarray(values) for values in ([0.0, 1.0], [2.0, 3.0], [0.5, -0.5])))
     action = Action(*(jnp.asarray(v) for v in ([0.7, 0.1], [5.0, 4.5], [0.0, 0.2], [2.5, 0.0])))
     return LoadingPlan(pose=pose, action=action)
 
 
 @pytest.fixture
-def document(plan):
+def document(plan: LoadingPlan) -> dict[str, Any]:
     performance = Performance(*(jnp.asarray([a, a + 1.0]) for a in (3.0, 11.0, 400.0)))
     transport = {"time": jnp.asarray([5.0, 6.0]), "work": np.zeros(2)}
     return io.plan_to_dict(plan, predicted=performance, transport=transport, world="low", seed=3)
 
 
-def test_a_plan_reads_back_the_same(tmp_path, plan, document):
+def test_a_plan_reads_back_the_same(
+    tmp_path: Path, plan: LoadingPlan, document: dict[str, Any]
+) -> None:
     io.write_plan(tmp_path / "plan.json", document)
     again, data = io.read_plan(tmp_path / "plan.json")
     for part in ("pose", "action"):
@@ -229,25 +252,25 @@ def test_a_plan_reads_back_the_same(tmp_path, plan, document):
     assert "simulated" not in load
 
 
-def test_numbers_of_numpy_and_jax_are_written(tmp_path, document):
+def test_numbers_of_numpy_and_jax_are_written(tmp_path: Path, document: dict[str, Any]) -> None:
     document.update(seed=np.int64(4), total={"mass": jnp.asarray(1.5), "all": np.ones(2)})
     io.write_plan(tmp_path / "plan.json", document)
     _, data = io.read_plan(tmp_path / "plan.json")
     assert (data["seed"], data["total"]) == (4, {"mass": 1.5, "all": [1.0, 1.0]})
 
 
-def refused_plan(path, match):
+def refused_plan(path: Path, match: str) -> None:
     with pytest.raises(InputError, match=match) as error:
         io.read_plan(path)
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
 
 
-def in_load(name, value):
+def in_load(name: str, value: object) -> Change:
     return lambda data: data["loads"][1].update({name: value})
 
 
-def in_action(name, value):
+def in_action(name: str, value: object) -> Change:
     return lambda data: data["loads"][1]["action"].update({name: value})
 
 
@@ -274,7 +297,9 @@ BAD_PLANS = [
 
 
 @pytest.mark.parametrize(("change", "match"), BAD_PLANS)
-def test_bad_plans_are_neither_read_nor_written(tmp_path, document, change, match):
+def test_bad_plans_are_neither_read_nor_written(
+    tmp_path: Path, document: dict[str, Any], change: Change, match: str
+) -> None:
     path = tmp_path / "plan.json"
     change(document)
     path.write_text(json.dumps(document))
@@ -289,19 +314,21 @@ def test_bad_plans_are_neither_read_nor_written(tmp_path, document, change, matc
     "text",
     ["", "{", "[]", "3", "null", "[" * 100_000, "\x00", '{"format": "wlplan.plan/1"', "1e999"],
 )
-def test_files_that_are_no_plans_are_refused(tmp_path, text):
+def test_files_that_are_no_plans_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "plan.json").write_text(text)
     refused_plan(tmp_path / "plan.json", "plan")
 
 
-def test_plans_that_are_no_text_or_no_file_are_refused(tmp_path):
+def test_plans_that_are_no_text_or_no_file_are_refused(tmp_path: Path) -> None:
     (tmp_path / "plan.json").write_bytes(b"\xff\xfe\x00")
     refused_plan(tmp_path / "plan.json", "cannot be read")
     refused_plan(tmp_path / "none.json", "no such plan file")
     refused_plan(tmp_path, "is a folder")
 
 
-def test_actions_that_went_through_float32_are_put_back_into_the_box(tmp_path, document):
+def test_actions_that_went_through_float32_are_put_back_into_the_box(
+    tmp_path: Path, document: dict[str, Any]
+) -> None:
     document["loads"][0]["action"].update(delta_bm=0.7 + 1e-8, k_bm=-1e-8)
     io.write_plan(tmp_path / "plan.json", document)
     plan, _ = io.read_plan(tmp_path / "plan.json")
@@ -311,7 +338,7 @@ def test_actions_that_went_through_float32_are_put_back_into_the_box(tmp_path, d
 # --- writing in one piece
 
 
-def test_files_are_replaced_in_one_piece(tmp_path):
+def test_files_are_replaced_in_one_piece(tmp_path: Path) -> None:
     path = tmp_path / "note.txt"
     io.write_text_atomic(path, "ä")
     io.write_text_atomic(path, "ö")
@@ -320,11 +347,13 @@ def test_files_are_replaced_in_one_piece(tmp_path):
 
 
 @pytest.mark.parametrize("failure", [OSError("disk full"), KeyboardInterrupt()])
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, failure):
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException
+) -> None:
     path = tmp_path / "note.txt"
     path.write_text("old")
 
-    def fail(*_):
+    def fail(*_: object) -> None:
         raise failure
 
     monkeypatch.setattr(os, "replace", fail)
@@ -335,7 +364,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
     assert [entry.name for entry in tmp_path.iterdir()] == ["note.txt"]
 
 
-def test_places_that_cannot_be_written_are_refused(tmp_path, pile):
+def test_places_that_cannot_be_written_are_refused(tmp_path: Path, pile: Pile) -> None:
     for path in (tmp_path / "none" / "pile.npz", tmp_path / ("n" * 300 + ".npz")):
         with pytest.raises(InputError, match="cannot be written") as error:
             io.write_pile(path, pile)

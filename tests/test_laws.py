@@ -6,20 +6,20 @@ import pytest
 from laws import assert_gradient, assert_volume_kept
 
 
-def test_the_volume_check_can_fail():
+def test_the_volume_check_can_fail() -> None:
     height = jnp.ones((8, 8))
     with pytest.raises(AssertionError, match="volume"):
         assert_volume_kept(height, height.at[0, 0].add(1e-3))
 
 
-def test_the_gradient_check_passes_on_a_polynomial():
+def test_the_gradient_check_passes_on_a_polynomial() -> None:
     with jax.enable_x64(True):
         assert_gradient(lambda x: (x**3).sum(), jnp.asarray([0.5, -1.0, 2.0]))
 
 
-def test_the_gradient_check_sees_a_wrong_gradient():
+def test_the_gradient_check_sees_a_wrong_gradient() -> None:
     @jax.custom_jvp
-    def wrong(x):
+    def wrong(x: jax.Array) -> jax.Array:
         return (x**2).sum()
 
     # A gradient that is 0.1 % off must be found.
@@ -28,7 +28,7 @@ def test_the_gradient_check_sees_a_wrong_gradient():
         assert_gradient(wrong, jnp.asarray([0.5, -1.0]))
 
 
-def test_the_gradient_check_counts_kinks():
+def test_the_gradient_check_counts_kinks() -> None:
     with jax.enable_x64(True):
         assert assert_gradient(lambda x: jnp.abs(x).sum(), jnp.asarray([0.0, 1.0]), skip=1) == 1
         with pytest.raises(AssertionError, match="differ"):

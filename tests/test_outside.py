@@ -4,6 +4,8 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,14 +64,14 @@ def flat(pile, pose, action):
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path: Path) -> Path:
     (tmp_path / "mine.py").write_text(_MODULE)
     # Nothing in the folder stands in for what is installed.
     (tmp_path / "json.py").write_text("raise SystemExit('another json')")
     return tmp_path
 
 
-def command(folder, *words):
+def command(folder: Path, *words: object) -> dict[str, Any]:
     done = subprocess.run(
         # As the installed command does: without the current folder at the head of the path.
         [sys.executable, "-P", "-m", "wlplan", *map(str, words)],
@@ -81,10 +83,11 @@ def command(folder, *words):
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
     )
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    document: dict[str, Any] = json.loads(done.stdout)
+    return document
 
 
-def test_planner_objective_and_world_run_from_the_command_line(folder):
+def test_planner_objective_and_world_run_from_the_command_line(folder: Path) -> None:
     document = command(
         folder,
         *("plan", "--loads", 2, "--planner", "mine:Even", "--objective", "mine:goal"),
@@ -99,7 +102,7 @@ def test_planner_objective_and_world_run_from_the_command_line(folder):
     assert document["total"]["predicted"]["cost"] == pytest.approx(cost, rel=1e-4)
 
 
-def test_they_are_values_in_python_too(folder, monkeypatch):
+def test_they_are_values_in_python_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(folder))
     (folder / "json.py").unlink()
     import mine

@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "wlplan"
 
 
-def modules(package):
+def modules(package: Path) -> dict[str, Path]:
     """Name below the package -> file; a package has the name of its directory."""
     found = {}
     for path in sorted(package.rglob("*.py")):
@@ -20,17 +21,17 @@ def modules(package):
     return found
 
 
-def is_overload(node):
+def is_overload(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> bool:
     """Whether a definition only says one of the types of the next."""
     return any(isinstance(d, ast.Name) and d.id == "overload" for d in node.decorator_list)
 
 
-def undocumented(name, source):
+def undocumented(name: str, source: str) -> list[str]:
     """Public definitions without a docstring."""
     tree = ast.parse(source)
     missing = [] if ast.get_docstring(tree) else [name]
 
-    def visit(body, prefix):
+    def visit(body: Sequence[ast.stmt], prefix: str) -> None:
         for node in body:
             if isinstance(node, ast.If | ast.Try):
                 visit(node.body, prefix)
@@ -47,7 +48,7 @@ def undocumented(name, source):
     return missing
 
 
-def prints(source):
+def prints(source: str) -> list[int]:
     """Lines that call `print`."""
     return [
         node.lineno
@@ -61,14 +62,14 @@ def prints(source):
 FILES = modules(PACKAGE)
 
 
-def test_everything_public_has_a_docstring():
+def test_everything_public_has_a_docstring() -> None:
     missing = [
         entry for name, path in FILES.items() for entry in undocumented(name, path.read_text())
     ]
     assert not missing, missing
 
 
-def test_only_the_command_line_prints():
+def test_only_the_command_line_prints() -> None:
     found = {
         name: prints(path.read_text())
         for name, path in FILES.items()
@@ -77,7 +78,7 @@ def test_only_the_command_line_prints():
     assert not any(found.values()), {name: lines for name, lines in found.items() if lines}
 
 
-def test_importing_the_package_is_light():
+def test_importing_the_package_is_light() -> None:
     code = "import sys, wlplan; print(sorted({'jax', 'flax', 'matplotlib'} & set(sys.modules)))"
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
@@ -85,15 +86,16 @@ def test_importing_the_package_is_light():
     assert result.stdout.strip() == "[]"
 
 
-def test_every_public_name_exists_where_the_package_says():
+def test_every_public_name_exists_where_the_package_says() -> None:
     """Read off the files, since importing all of them takes seconds."""
     import wlplan
 
-    public = set()
+    public: set[str] = set()
     for node in ast.parse((PACKAGE / "__init__.pyi").read_text()).body:
         if not isinstance(node, ast.ImportFrom):
             continue
         # Its modules, and what it defines.
+        assert node.module is not None
         inside = f"{node.module}."
         defined = {name.removeprefix(inside) for name in FILES if name.startswith(inside)}
         for inner in ast.parse(FILES[node.module].read_text()).body:
@@ -107,12 +109,12 @@ def test_every_public_name_exists_where_the_package_says():
         defined |= {name for name in names if f"{node.module}.{name}" in FILES}
         assert names <= defined, (node.module, names - defined)
         public |= names
-    assert set(wlplan.__all__) == public <= set(dir(wlplan))
+    assert set(wlplan.__all__) == public <= set(dir(wlplan))  # type: ignore[attr-defined]
     with pytest.raises(AttributeError, match="no_such_name"):
-        _ = wlplan.no_such_name
+        _ = wlplan.no_such_name  # type: ignore[attr-defined]
 
 
-def test_the_checks_of_docstrings_and_prints_can_fail():
+def test_the_checks_of_docstrings_and_prints_can_fail() -> None:
     source = '"""Doc."""\nclass A:\n    """Doc."""\n    def b(self): print(1)\ndef _c(): pass\n'
     assert undocumented("m", source) == ["m.A.b"]
     assert undocumented("m", "x = 1") == ["m"]

@@ -6,6 +6,9 @@ import functools
 import math
 import operator
 import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,16 +18,19 @@ from wlplan.errors import InputError
 from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error, volume_lost
 from wlplan.report.page import render_report, write_report
 
+# Keys and places on the way to a value in a document.
+Way = tuple[str | int, ...]
+
 FIGURES = ((b"\x89PNG one", "The pile and the digs"), (b"\x89PNG two", "Predicted and simulated"))
 SETTINGS = {"planning, wall clock": "12 s"}
 DASH = "–"
 
 
-def performance(mass, time, work, **more):
+def performance(mass: float, time: float, work: float, **more: float) -> dict[str, float]:
     return {"mass": mass, "time": time, "work": work, **more}
 
 
-DOCUMENT = {
+DOCUMENT: dict[str, Any] = {
     "format": "wlplan.plan/1",
     "pile": {"file": "scan.npz", "sha256": "0a1b", "cells": [190, 160], "cell_size": 0.1},
     "soil": {"name": "gravel", "density": 1700.0},
@@ -61,11 +67,11 @@ NUMBERS = ("receiver", "total", "ledger", "loads")
 HOSTILE = "</title></style>\"'><script>alert(1)</script>{{ 7 * 7 }}"
 
 
-def rendered(document):
+def rendered(document: dict[str, Any]) -> Page:
     return Page(render_report(document, figures=FIGURES, settings=SETTINGS))
 
 
-def places(value, *way):
+def places(value: Any, *way: str | int) -> Iterator[tuple[Way, Any]]:
     """The way to every value inside of dicts and lists, with that value."""
     if way:
         yield way, value
@@ -74,10 +80,10 @@ def places(value, *way):
             yield from places(value[key], *way, key)
 
 
-def changed(way, *value):
+def changed(way: Way, *value: Any) -> dict[str, Any]:
     """The document with another value at the end of a way; without one it is taken out."""
     document = copy.deepcopy(DOCUMENT)
-    inner = functools.reduce(operator.getitem, way[:-1], document)
+    inner = functools.reduce(operator.getitem, way[:-1], cast("Any", document))
     if value:
         (inner[way[-1]],) = value
     else:
@@ -88,7 +94,7 @@ def changed(way, *value):
 # --- laws
 
 
-def test_a_whole_document_is_shown_without_a_dash():
+def test_a_whole_document_is_shown_without_a_dash() -> None:
     """So a name that the template misspells is found."""
     text = rendered(DOCUMENT).text
     assert DASH not in text
@@ -100,7 +106,7 @@ def test_a_whole_document_is_shown_without_a_dash():
 
 
 @pytest.mark.parametrize("new", [(), (None,), (math.nan,)], ids=["missing", "null", "nan"])
-def test_a_number_that_is_not_there_is_a_dash(new):
+def test_a_number_that_is_not_there_is_a_dash(new: tuple[float | None, ...]) -> None:
     numbers = [
         way
         for way, value in places(DOCUMENT)
@@ -113,24 +119,25 @@ def test_a_number_that_is_not_there_is_a_dash(new):
         assert not re.search(r"\b(None|nan|Undefined)\b", text), way
 
 
-def test_a_part_that_is_missing_leaves_a_page():
+def test_a_part_that_is_missing_leaves_a_page() -> None:
     for way, _ in places(DOCUMENT):
         assert "What it does not tell" in rendered(changed(way)).text, way
 
 
 @pytest.mark.parametrize("document", [{}, {"loads": []}, {"loads": [{}]}, {"ledger": None}])
-def test_next_to_nothing_is_a_page_too(document):
+def test_next_to_nothing_is_a_page_too(document: dict[str, Any]) -> None:
     text = rendered(document).text
     assert text.count(DASH) > 10
     for words in ("a pile", "an unnamed planner", "The ledger is incomplete"):
         assert words in text
 
 
-def test_every_text_is_escaped():
+def test_every_text_is_escaped() -> None:
     document = copy.deepcopy(DOCUMENT)
     for way, value in places(DOCUMENT):
         if isinstance(value, str):
-            functools.reduce(operator.getitem, way[:-1], document)[way[-1]] = HOSTILE
+            inner = functools.reduce(operator.getitem, way[:-1], cast("Any", document))
+            inner[way[-1]] = HOSTILE
     document["pile"][HOSTILE] = [HOSTILE]
     source = render_report(
         document, figures=[(b"", HOSTILE), (b"", HOSTILE)], settings={HOSTILE: HOSTILE}
@@ -144,7 +151,7 @@ def test_every_text_is_escaped():
     assert len(page.tags) == len(rendered(DOCUMENT).tags) + 3
 
 
-def test_a_text_where_a_number_should_be_is_no_number():
+def test_a_text_where_a_number_should_be_is_no_number() -> None:
     for way, value in places(DOCUMENT):
         if way[0] in NUMBERS and isinstance(value, int | float):
             page = rendered(changed(way, HOSTILE))
@@ -152,7 +159,7 @@ def test_a_text_where_a_number_should_be_is_no_number():
             assert "script" not in page.tags, way
 
 
-def test_the_page_loads_nothing():
+def test_the_page_loads_nothing() -> None:
     source = render_report(DOCUMENT, figures=FIGURES, settings=SETTINGS)
     page = Page(source)
     assert page.links == [
@@ -163,7 +170,7 @@ def test_the_page_loads_nothing():
         assert word not in source
 
 
-def test_the_reader_of_pages_can_fail():
+def test_the_reader_of_pages_can_fail() -> None:
     with pytest.raises(AssertionError):
         Page("<p><b>crossed</p></b>")
     with pytest.raises(AssertionError):
@@ -174,7 +181,7 @@ def test_the_reader_of_pages_can_fail():
 # --- values
 
 
-def test_numbers_are_written_for_people():
+def test_numbers_are_written_for_people() -> None:
     document = changed(("total", "simulated", "work"), np.float32(1234567.0))
     assert "1,234,567 kJ" in rendered(document).text
     text = rendered(DOCUMENT).text
@@ -182,13 +189,13 @@ def test_numbers_are_written_for_people():
     assert "−10.0\u00a0%" in text  # time, 18 for 20
 
 
-def test_one_load_is_no_loads():
+def test_one_load_is_no_loads() -> None:
     document = changed(("loads", 1))
     assert "Loading plan: 1 load from scan.npz" in rendered(document).text
     assert "Loading plan: 2 loads from scan.npz" in rendered(DOCUMENT).text
 
 
-def test_a_ledger_is_closed_off_or_incomplete():
+def test_a_ledger_is_closed_off_or_incomplete() -> None:
     ledger = DOCUMENT["ledger"]
     assert volume_lost(ledger) == 2.5
     assert ledger_error(ledger) <= LEDGER_TOLERANCE
@@ -199,7 +206,7 @@ def test_a_ledger_is_closed_off_or_incomplete():
     assert "differ by\n25 %" in rendered({**DOCUMENT, "ledger": off}).text
 
 
-def test_a_report_is_written_in_one_piece_or_not_at_all(tmp_path):
+def test_a_report_is_written_in_one_piece_or_not_at_all(tmp_path: Path) -> None:
     path = write_report(tmp_path, DOCUMENT, figures=FIGURES, settings=SETTINGS)
     assert [path] == list(tmp_path.iterdir())
     written = path.read_text(encoding="utf-8")

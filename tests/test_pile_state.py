@@ -1,5 +1,8 @@
 """Laws of the pile state predictors: mass exact, never below ground, finite on flat ground."""
 
+from pathlib import Path
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,14 +28,14 @@ from wlplan.terrain.automaton import relax
 from wlplan.terrain.automaton.slopes import steepest_slope
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
-from wlplan.training import PhiSettings, PhiVaeSettings, evaluate_pile_state, train
-from wlplan.types import LocalHeightmap, action_from
+from wlplan.training import PhiSettings, PhiVaeSettings, PileStateErrors, evaluate_pile_state, train
+from wlplan.types import LocalHeightmap, Pile, Pose, action_from
 from wlplan.worlds.learned import LearnedWorld
 
 ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
 
 
-def slopes(count, seed=0):
+def slopes(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Maps of a slope that begins 1 m in, and the same with a dig of some size."""
     random = np.random.default_rng(seed)
     x = np.maximum(np.arange(52) * 0.1 - 1.0, 0.0)
@@ -45,7 +48,7 @@ def slopes(count, seed=0):
     return before.astype(np.float32), after.astype(np.float32)
 
 
-def model_of(seed=0):
+def model_of(seed: int = 0) -> HeightChangeModel:
     network = HeightChange((32,), rngs=nnx.Rngs(seed))
     before, after = (jnp.asarray(v) for v in slopes(60))
     random = np.random.default_rng(1)
@@ -58,7 +61,7 @@ def model_of(seed=0):
     return HeightChangeModel(params, graph)
 
 
-def local(height):
+def local(height: jax.Array) -> LocalHeightmap:
     return LocalHeightmap(jnp.asarray(height), 0.1, 1.0)
 
 
@@ -66,7 +69,7 @@ def local(height):
 
 
 @pytest.mark.parametrize("volume", [0.0, 0.3, 1.7])
-def test_exactly_the_wanted_volume_leaves_and_nothing_goes_below_the_floor(volume):
+def test_exactly_the_wanted_volume_leaves_and_nothing_goes_below_the_floor(volume: float) -> None:
     random = np.random.default_rng(0)
     change = jnp.asarray(random.normal(-0.1, 0.2, (52, 52)), jnp.float32)
     above = jnp.asarray(slopes(1)[0][0].clip(0.0))
@@ -76,7 +79,7 @@ def test_exactly_the_wanted_volume_leaves_and_nothing_goes_below_the_floor(volum
     assert (np.asarray(got)[np.asarray(change) > 0.0] >= 0.0).all()
 
 
-def test_where_too_little_is_there_all_of_it_leaves_and_nothing_appears():
+def test_where_too_little_is_there_all_of_it_leaves_and_nothing_appears() -> None:
     above = jnp.full((52, 52), 0.01)
     change = jnp.full((52, 52), -0.2).at[:10].set(0.1)
     got = project(change, above, jnp.asarray(5.0))
@@ -84,7 +87,7 @@ def test_where_too_little_is_there_all_of_it_leaves_and_nothing_appears():
     assert float(got.sum()) <= 1e-6
 
 
-def test_the_projection_passes_gradients_and_stays_finite_on_flat_ground():
+def test_the_projection_passes_gradients_and_stays_finite_on_flat_ground() -> None:
     change = jnp.asarray(np.random.default_rng(0).normal(-0.1, 0.1, (52, 52)), jnp.float32)
     volume = jnp.asarray(1.0)
     above = jnp.asarray(slopes(1)[0][0].clip(0.0))
@@ -100,7 +103,7 @@ def test_the_projection_passes_gradients_and_stays_finite_on_flat_ground():
 # --- ours
 
 
-def test_patterns_give_back_what_they_were_made_from():
+def test_patterns_give_back_what_they_were_made_from() -> None:
     before, after = (jnp.asarray(v) for v in slopes(40))
     patterns = Patterns(20)
     patterns.fit(after - before)
@@ -109,10 +112,10 @@ def test_patterns_give_back_what_they_were_made_from():
     assert float(jnp.abs(after - before).mean()) > 1e-2
 
 
-def test_the_change_has_the_mass_and_a_finite_gradient():
+def test_the_change_has_the_mass_and_a_finite_gradient() -> None:
     model = model_of()
 
-    def after(height, action, volume):
+    def after(height: jax.Array, action: jax.Array, volume: jax.Array) -> jax.Array:
         ground = jnp.zeros((52, 52))
         return height + model(local(height), action, volume, ground)
 
@@ -131,13 +134,13 @@ def test_the_change_has_the_mass_and_a_finite_gradient():
 # --- the paper's
 
 
-def test_patches_come_back():
+def test_patches_come_back() -> None:
     maps = jnp.arange(2.0 * 4 * 4 * 3).reshape(2, 4, 4, 3)
     np.testing.assert_array_equal(_scattered(_gathered(maps)), maps)
     np.testing.assert_array_equal(_gathered(maps)[0, 0, 0, :6], maps[0, 0, :2].ravel())
 
 
-def test_scaling_and_blending():
+def test_scaling_and_blending() -> None:
     before, after = (jnp.asarray(v[0]) for v in slopes(1))
     unit, low, span = scaled(before, jnp.zeros((52, 52)))
     assert (float(unit.min()), float(unit.max())) == (0.0, 1.0)
@@ -148,7 +151,7 @@ def test_scaling_and_blending():
     np.testing.assert_allclose(mixed[10:-10, 10:-10], after[10:-10, 10:-10], atol=1e-6)
 
 
-def test_the_papers_model_is_finite_on_flat_ground():
+def test_the_papers_model_is_finite_on_flat_ground() -> None:
     graph, params = nnx.split(PhiVae((16,), rngs=nnx.Rngs(0)))
     model = VaePileStateModel(params, graph)
     for height in (jnp.zeros((52, 52)), jnp.asarray(slopes(1)[0][0])):
@@ -159,7 +162,7 @@ def test_the_papers_model_is_finite_on_flat_ground():
     assert float(jnp.abs(slope[1]).max()) > 0.0
 
 
-def test_the_papers_model_predicts_a_change_that_fades_along_the_edges_or_not():
+def test_the_papers_model_predicts_a_change_that_fades_along_the_edges_or_not() -> None:
     graph, params = nnx.split(PhiVae((16,), rngs=nnx.Rngs(0)))
     model, height = VaePileStateModel(params, graph), jnp.asarray(slopes(1)[0][0])
     blending, plain = (
@@ -171,7 +174,7 @@ def test_the_papers_model_predicts_a_change_that_fades_along_the_edges_or_not():
     assert np.any(plain[0] != 0.0)
 
 
-def test_which_predictor_conserves_the_volume_is_said():
+def test_which_predictor_conserves_the_volume_is_said() -> None:
     assert HeightChangeModel.conserves_volume
     assert not VaePileStateModel.conserves_volume
 
@@ -180,7 +183,7 @@ def test_which_predictor_conserves_the_volume_is_said():
 
 
 @pytest.fixture(scope="module")
-def data():
+def data() -> Dataset:
     before, after = slopes(240)
     n = len(before)
     columns = {name: np.zeros((n, *v.shape), v.dtype) for name, v in VARIABLES.items()}
@@ -195,9 +198,10 @@ def data():
     return Dataset(**columns, attributes={"soil": {"density": 1727.0}})
 
 
-def test_training_learns_the_change_and_a_model_comes_back(data, tmp_path):
-    settings = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
+def test_training_learns_the_change_and_a_model_comes_back(data: Dataset, tmp_path: Path) -> None:
+    settings: dict[str, Any] = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
     model, errors = train(PhiSettings(epochs=30, **settings), data, out=tmp_path / "phi")
+    assert isinstance(errors, PileStateErrors)
     unchanged = np.abs(data.h52 - data.h52_after).sum(axis=(1, 2)).mean() * 0.01
     assert errors.mean_absolute < 0.2 * unchanged
     assert abs(errors.total_volume) < 1e-4
@@ -207,7 +211,7 @@ def test_training_learns_the_change_and_a_model_comes_back(data, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["phi"]
 
 
-def test_the_errors_are_those_of_the_papers_formulas(data):
+def test_the_errors_are_those_of_the_papers_formulas(data: Dataset) -> None:
     model = model_of()
     errors = evaluate_pile_state(model, data)
     volume = jnp.asarray(data.mass / 1.727)
@@ -223,7 +227,7 @@ def test_the_errors_are_those_of_the_papers_formulas(data):
     assert errors.cycles == 240
 
 
-def test_what_a_code_holds_of_a_map_moves_with_it(data):
+def test_what_a_code_holds_of_a_map_moves_with_it(data: Dataset) -> None:
     phi = PhiVae((8,), rngs=nnx.Rngs(0))
     phi.mean[...] = jnp.asarray(data.h52.mean(axis=0))
     graph, params = nnx.split(phi)
@@ -235,15 +239,17 @@ def test_what_a_code_holds_of_a_map_moves_with_it(data):
     # The decoder alone tells what comes out: one that always says 0 leaves the least height.
     for layer in phi.vae.up:
         layer.kernel[...] = jnp.zeros_like(layer.kernel)
+        assert layer.bias is not None
         layer.bias[...] = jnp.zeros_like(layer.bias)
     empty = VaePileStateModel(nnx.split(phi)[1], graph).reconstruction(local(height))
     np.testing.assert_allclose(empty - phi.mean[...], (height - phi.mean[...]).min(), atol=1e-5)
 
 
-def test_both_stages_of_the_paper_are_trained(data, tmp_path):
+def test_both_stages_of_the_paper_are_trained(data: Dataset, tmp_path: Path) -> None:
     done = []
     settings = PhiVaeSettings(epochs=2, hidden=(16,))
     _, errors = train(settings, data, out=tmp_path / "vae", progress=lambda *n: done.append(n))
+    assert isinstance(errors, PileStateErrors)
     assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert np.isfinite(errors.mean_absolute)
     load_model(tmp_path / "vae", "phi_vae")
@@ -251,9 +257,10 @@ def test_both_stages_of_the_paper_are_trained(data, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def psi_high():
+def psi_high() -> HighPerformanceModel:
     psi = PsiHigh((16,), encoder="principal", rngs=nnx.Rngs(0))
     # A load of about a tonne, and some that hangs on the inputs.
+    assert psi.head.output.bias is not None
     psi.head.output.bias[...] = jnp.full(3, 0.15)
     psi.head.output.kernel[...] = 0.05 * psi.head.output.kernel[...]
     graph, params = nnx.split(psi)
@@ -266,17 +273,20 @@ def psi_high():
     return HighPerformanceModel(params=params, graph=graph, **normalisers)
 
 
-def first_loading(pile):
-    return jax.tree.map(lambda leaf: leaf[0], edge_poses(toe_contour(pile), 1))
+def first_loading(pile: Pile) -> Pose:
+    pose: Pose = jax.tree.map(lambda leaf: leaf[0], edge_poses(toe_contour(pile), 1))
+    return pose
 
 
-def removed(pile, after):
-    volume = np.asarray(pile.height - after.height, np.float64).sum() * pile.cell_size**2
+def removed(pile: Pile, after: Pile) -> float:
+    volume = float(np.asarray(pile.height - after.height, np.float64).sum()) * pile.cell_size**2
     return volume * GRAVEL.density / 1000.0
 
 
 @pytest.mark.parametrize("settle", [True, False])
-def test_the_high_world_removes_the_mass_that_it_reports(psi_high, settle):
+def test_the_high_world_removes_the_mass_that_it_reports(
+    psi_high: HighPerformanceModel, settle: bool
+) -> None:
     world = LearnedWorld(psi_high, model_of(), settle=settle)
     pile = relax(seed_pile("conical", slope=np.radians(30.0), height=2.0))
     pose = first_loading(pile)
@@ -285,14 +295,16 @@ def test_the_high_world_removes_the_mass_that_it_reports(psi_high, settle):
     assert removed(pile, after) == pytest.approx(float(p.mass), rel=1e-4)
     assert float(after.height.min()) >= float(pile.height.min()) - 1e-5
 
-    def cost(heading):
+    def cost(heading: jax.Array) -> jax.Array:
         height, q = world(pile, pose.replace(heading=heading), action_from(ACTION))
         return q.work / q.mass + height.height.mean()
 
     assert np.isfinite(jax.grad(cost)(pose.heading))
 
 
-def test_a_pile_that_holds_less_than_the_load_gives_what_it_has(psi_high):
+def test_a_pile_that_holds_less_than_the_load_gives_what_it_has(
+    psi_high: HighPerformanceModel,
+) -> None:
     # Two tenths of a tonne in all where about a tonne is predicted.
     pile = seed_pile("conical", slope=np.radians(30.0), height=2.0)
     pose = first_loading(pile)
@@ -304,7 +316,9 @@ def test_a_pile_that_holds_less_than_the_load_gives_what_it_has(psi_high):
     assert float(after.height.min()) >= -1e-6
 
 
-def test_only_a_map_that_the_automaton_was_asked_for_is_never_too_steep(psi_high):
+def test_only_a_map_that_the_automaton_was_asked_for_is_never_too_steep(
+    psi_high: HighPerformanceModel,
+) -> None:
     pile = relax(seed_pile("conical", slope=np.radians(30.0), height=2.0))
     pose = first_loading(pile)
     limit = np.radians(1.0) + GRAVEL.repose_angle + 1e-3

@@ -2,16 +2,19 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.typing import DTypeLike
 from laws import assert_gradient
 
 import wlplan
 from wlplan.actions import squash, unsquash
 from wlplan.errors import InputError
+from wlplan.planning.job import PlanResult
 from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.planners import Gradient, Greedy, Nominal
 from wlplan.planning.poses import distance_to_toe, pose_at, toe_of
@@ -32,13 +35,13 @@ GRADIENT = Gradient(
 )
 
 
-def cone(dtype=jnp.float32, radius=5.0, cells=161):
+def cone(dtype: DTypeLike = jnp.float32, radius: float = 5.0, cells: int = 161) -> Pile:
     x = 0.1 * np.arange(cells) - 8.0
     height = np.maximum(0.5 * (radius - np.hypot(x[:, None], x[None, :])), 0.0)
     return Pile(jnp.asarray(height, dtype), 0.1, (-8.0, -8.0))
 
 
-def bowl_world(pile, pose, action):
+def bowl_world(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
     """The load falls with the distance of the action from the best one; digging is real."""
     part = (action_vector(action) - BEST_ACTION) / np.array([0.7, 5.0, 0.7, 5.0])
     mass = 3.0 / (1.0 + 4.0 * (part**2).sum())
@@ -47,7 +50,7 @@ def bowl_world(pile, pose, action):
     return after, Performance(mass=mass, time=9.0 + mass, work=300.0 + 20.0 * mass)
 
 
-def circle(radius=4.7, n=290):
+def circle(radius: float = 4.7, n: int = 290) -> ToeContour:
     """The toe of the cone where it rises by TOE_RISE."""
     angle = 2 * np.pi * np.arange(n) / n
     return ToeContour(
@@ -59,7 +62,7 @@ def circle(radius=4.7, n=290):
     )
 
 
-def test_squashing_stays_in_the_box_and_is_inverted():
+def test_squashing_stays_in_the_box_and_is_inverted() -> None:
     raw = jnp.asarray([-40.0, 40.0, 0.0, 1.0])
     action = action_vector(squash(raw))
     np.testing.assert_allclose(action[:3], [0.0, 5.0, 0.35], atol=1e-6)
@@ -69,7 +72,7 @@ def test_squashing_stays_in_the_box_and_is_inverted():
 
 
 @pytest.mark.parametrize("position", [0.0, 0.3, 0.999, 1.25, -0.4])
-def test_a_pose_is_on_the_toe_and_points_into_the_pile(position):
+def test_a_pose_is_on_the_toe_and_points_into_the_pile(position: float) -> None:
     toe, pile = toe_of(circle()), cone()
     pose = pose_at(toe, pile, jnp.asarray(position), jnp.asarray(0.0))
     assert math.hypot(pose.x, pose.y) == pytest.approx(5.0 - TOE_RISE / 0.5, abs=0.15)
@@ -77,7 +80,7 @@ def test_a_pose_is_on_the_toe_and_points_into_the_pile(position):
     assert math.cos(float(pose.heading) - angle - np.pi) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_pose_follows_the_toe_of_a_dug_pile():
+def test_the_pose_follows_the_toe_of_a_dug_pile() -> None:
     toe, pile = toe_of(circle()), cone()
     first = pose_at(toe, pile, jnp.asarray(0.1), jnp.asarray(0.2))
     dug, *_ = excavate(pile, first, jnp.asarray(2.0), width=2.7)
@@ -88,25 +91,25 @@ def test_the_pose_follows_the_toe_of_a_dug_pile():
     assert float(distance_to_toe(dug, second, width=2.7)) == pytest.approx(0.0, abs=0.02)
 
 
-def test_without_a_pile_on_the_way_the_pose_stays_on_the_contour():
+def test_without_a_pile_on_the_way_the_pose_stays_on_the_contour() -> None:
     flat = Pile(jnp.zeros((161, 161)), 0.1, (-8.0, -8.0))
     pose = pose_at(toe_of(circle()), flat, jnp.asarray(0.0), jnp.asarray(0.0))
     assert float(pose.x) == pytest.approx(4.7, abs=1e-5)
 
 
-def test_the_pose_is_differentiable_along_the_toe():
+def test_the_pose_is_differentiable_along_the_toe() -> None:
     with jax.enable_x64(True):
         pile = cone(jnp.float64)
         toe = toe_of(circle(), dtype=np.float64)
 
-        def cost(inputs):
+        def cost(inputs: tuple[jax.Array, jax.Array]) -> jax.Array:
             pose = pose_at(toe, pile, *inputs)
             return pose.x + 0.3 * pose.y - 0.7 * pose.heading
 
         assert_gradient(cost, (jnp.asarray(0.1237), jnp.asarray(0.21)), relative=1e-5)
 
 
-def test_only_accessible_points_are_dug():
+def test_only_accessible_points_are_dug() -> None:
     contour = circle()
     accessible = contour.accessible.copy()
     accessible[50:120] = accessible[200:220] = False
@@ -121,13 +124,13 @@ def test_only_accessible_points_are_dug():
         assert accessible[round(turn) % 290] or accessible[round(turn - 0.6) % 290]
 
 
-def test_another_pile_on_the_same_grid_needs_no_compiling(caplog):
+def test_another_pile_on_the_same_grid_needs_no_compiling(caplog: pytest.LogCaptureFixture) -> None:
     """The next action has to come within a second, on a pile whose toe the last load changed."""
     first, second = cone(), cone(radius=3.0)
     lengths = [toe_contour(pile).length for pile in (first, second)]
     assert abs(lengths[0] - lengths[1]) > 3.0
 
-    def compilations(pile):
+    def compilations(pile: Pile) -> list[str]:
         caplog.clear()
         with jax.log_compiles():
             plan_loads(bowl_world, pile, loads=1, planner=GREEDY)
@@ -139,7 +142,7 @@ def test_another_pile_on_the_same_grid_needs_no_compiling(caplog):
 
 
 @pytest.mark.parametrize("planner", [GREEDY, NOMINAL])
-def test_the_best_action_is_found(planner):
+def test_the_best_action_is_found(planner: Greedy | Nominal) -> None:
     planner = dataclasses.replace(planner, refine_steps=40)
     plan = plan_loads(bowl_world, cone(), loads=2, planner=planner, contour=circle()).plan
     found = np.asarray(action_vector(plan.action)) / np.array([0.7, 5.0, 0.7, 5.0])
@@ -147,7 +150,7 @@ def test_the_best_action_is_found(planner):
 
 
 @pytest.fixture(scope="module")
-def plans():
+def plans() -> dict[str, PlanResult]:
     results = {}
     for planner in (NOMINAL, GREEDY, GRADIENT):
         results[type(planner).__name__.lower()] = plan_loads(
@@ -156,12 +159,14 @@ def plans():
     return results
 
 
-def test_a_gradient_plan_costs_at_most_what_greedy_and_nominal_cost(plans):
+def test_a_gradient_plan_costs_at_most_what_greedy_and_nominal_cost(
+    plans: dict[str, PlanResult],
+) -> None:
     assert plans["gradient"].cost <= plans["greedy"].cost
     assert plans["gradient"].cost <= plans["nominal"].cost
 
 
-def test_the_same_seed_gives_the_same_plan(plans):
+def test_the_same_seed_gives_the_same_plan(plans: dict[str, PlanResult]) -> None:
     again = plan_loads(bowl_world, cone(), loads=3, planner=GREEDY, contour=circle())
     for a, b in zip(
         jax.tree.leaves(again.plan), jax.tree.leaves(plans["greedy"].plan), strict=True
@@ -169,7 +174,7 @@ def test_the_same_seed_gives_the_same_plan(plans):
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_result_is_what_its_plan_yields(plans):
+def test_a_result_is_what_its_plan_yields(plans: dict[str, PlanResult]) -> None:
     """The plan in a result, played again with its poses as they are, gives the result."""
     result = plans["gradient"]
     assert result.plan.pose.x.shape == (3,)
@@ -182,14 +187,14 @@ def test_a_result_is_what_its_plan_yields(plans):
     assert float(again.cost) == pytest.approx(float(result.cost), rel=1e-5)
 
 
-def test_a_referee_has_the_last_word_among_the_candidates():
-    def contrary(pile, pose, action):
+def test_a_referee_has_the_last_word_among_the_candidates() -> None:
+    def contrary(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         """Likes what the planner's world does not: another best action."""
         after, performance = bowl_world(pile, pose, action)
         gain = action_vector(action) @ np.array([0.0, 1.0, 0.0, 0.0])
         return after, performance.replace(mass=performance.mass * (0.5 + 0.2 * gain))
 
-    options = {
+    options: dict[str, Any] = {
         "loads": 2,
         "planner": GRADIENT,
         "contour": circle(),
@@ -206,6 +211,8 @@ def test_a_referee_has_the_last_word_among_the_candidates():
     )
     assert alone.refereed is None
     # The greedy plan is among the candidates, and the limit in the planner's own world.
+    assert judged.refereed is not None
+    assert greedy.refereed is not None
     assert judged.refereed.cost <= greedy.refereed.cost * (1 + 1e-6)
     assert judged.cost <= greedy.cost * (1 + 1e-5)
     # What the referee saw is the plan, with the poses of the result.
@@ -214,7 +221,7 @@ def test_a_referee_has_the_last_word_among_the_candidates():
     assert float(judged.refereed.cost) != float(judged.cost)
 
 
-def test_bad_requests_are_refused():
+def test_bad_requests_are_refused() -> None:
     with pytest.raises(InputError, match="unknown planner"):
         plan_loads(bowl_world, cone(), planner="best")
     with pytest.raises(InputError, match="at least 1"):
@@ -227,7 +234,7 @@ def test_bad_requests_are_refused():
         plan_loads(bowl_world, Pile(jnp.zeros((100, 100)), 0.1))
 
 
-def test_a_plan_can_be_made_of_loading_plan_leaves():
+def test_a_plan_can_be_made_of_loading_plan_leaves() -> None:
     plan = wlplan.LoadingPlan(
         pose=Pose(jnp.asarray([-5.0]), jnp.asarray([0.0]), jnp.asarray([0.0])),
         action=Action(*(jnp.asarray([v], jnp.float32) for v in BEST_ACTION)),

@@ -3,6 +3,9 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,10 +41,10 @@ MACHINE_ANGLES = ("boom_low", "boom_carry", "boom_high", "tilt_end", "boom_speed
 
 
 @pytest.fixture
-def write(tmp_path):
+def write(tmp_path: Path) -> Callable[..., Path]:
     """Write a TOML file and return its path."""
 
-    def write_text(text, name="given.toml"):
+    def write_text(text: str, name: str = "given.toml") -> Path:
         path = tmp_path / name
         path.write_text(text, encoding="utf-8")
         return path
@@ -49,7 +52,7 @@ def write(tmp_path):
     return write_text
 
 
-def refused(make, *words):
+def refused(make: Callable[[], object], *words: str) -> str:
     with pytest.raises(InputError) as caught:
         make()
     message = str(caught.value)
@@ -64,7 +67,7 @@ def refused(make, *words):
 
 
 @pytest.mark.parametrize("name", SOILS)
-def test_every_preset_soil_makes_sense(name):
+def test_every_preset_soil_makes_sense(name: str) -> None:
     soil = soil_named(name)
     check_soil(soil)
     assert soil == SOILS[name]
@@ -75,11 +78,11 @@ def test_every_preset_soil_makes_sense(name):
 
 
 @pytest.mark.parametrize("name", MACHINES)
-def test_every_preset_machine_makes_sense(name):
+def test_every_preset_machine_makes_sense(name: str) -> None:
     check_machine(machine_named(name))
 
 
-def test_the_presets_that_are_asked_for():
+def test_the_presets_that_are_asked_for() -> None:
     assert {"gravel", "sand", "wet-sand", "dirt", "clay"} <= set(SOILS)
     assert wlplan.soil_named("gravel") is GRAVEL
     assert wlplan.machine_named("wa320") is WA320
@@ -87,7 +90,7 @@ def test_the_presets_that_are_asked_for():
     assert CLAY.cohesion > SOILS["dirt"].cohesion > SAND.cohesion == 0.0
 
 
-def test_every_field_has_its_range_and_the_map_its_size():
+def test_every_field_has_its_range_and_the_map_its_size() -> None:
     assert list(ranges_of(Soil)) == SOIL_FIELDS
     assert list(ranges_of(WheelLoader)) == MACHINE_FIELDS
     assert pytest.approx(STATE_CELLS * CELL_SIZE) == parameters.MAP_WIDTH
@@ -103,7 +106,7 @@ def test_every_field_has_its_range_and_the_map_its_size():
 # --- files
 
 
-def toml(values, angles):
+def toml(values: Soil | WheelLoader, angles: Collection[str]) -> str:
     """All values of a soil or machine as a TOML file."""
     lines = []
     for name, value in dataclasses.asdict(values).items():
@@ -117,18 +120,18 @@ def toml(values, angles):
 
 
 @pytest.mark.parametrize("name", SOILS)
-def test_a_soil_goes_through_a_file(write, name):
+def test_a_soil_goes_through_a_file(write: Callable[..., Path], name: str) -> None:
     found = soil_named(write(toml(SOILS[name], ANGLES)))
     assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(SOILS[name]), rel=1e-12)
 
 
-def test_a_machine_goes_through_a_file(write):
+def test_a_machine_goes_through_a_file(write: Callable[..., Path]) -> None:
     larger = dataclasses.replace(WA320, bucket_width=2.9, tilt_speed=math.radians(40.0))
     found = machine_named(str(write(toml(larger, MACHINE_ANGLES))))
     assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(larger), rel=1e-12)
 
 
-def test_a_file_may_start_from_a_preset(write):
+def test_a_file_may_start_from_a_preset(write: Callable[..., Path]) -> None:
     found = soil_named(write('preset = "clay"\ndensity = 1700\nfriction_deg = 22\n'))
     assert found == dataclasses.replace(CLAY, density=1700.0, friction=math.radians(22.0))
     assert isinstance(found.density, float)
@@ -138,14 +141,16 @@ def test_a_file_may_start_from_a_preset(write):
     )
 
 
-def test_a_preset_goes_before_a_file_of_its_name(write, tmp_path, monkeypatch):
+def test_a_preset_goes_before_a_file_of_its_name(
+    write: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write("density = 1600", "sand")
     monkeypatch.chdir(tmp_path)
     assert soil_named("sand") == SAND
     assert soil_named("./sand") == dataclasses.replace(GRAVEL, density=1600.0)
 
 
-def test_the_ends_of_a_range_count_as_inside(write):
+def test_the_ends_of_a_range_count_as_inside(write: Callable[..., Path]) -> None:
     assert math.degrees(soil_named(write("friction_deg = 60")).friction) == pytest.approx(60.0)
     assert machine_named(write("bucket_width = 5.2")).bucket_width == 5.2
 
@@ -182,7 +187,9 @@ def test_the_ends_of_a_range_count_as_inside(write):
         (60_000 * "# ", ["too large"]),
     ],
 )
-def test_nonsense_in_a_soil_file_is_refused_by_name(write, text, words):
+def test_nonsense_in_a_soil_file_is_refused_by_name(
+    write: Callable[..., Path], text: str, words: list[str]
+) -> None:
     refused(lambda: soil_named(write(text)), "given.toml", *words)
 
 
@@ -204,11 +211,13 @@ def test_nonsense_in_a_soil_file_is_refused_by_name(write, text, words):
         ('preset = "gravel"', ["preset is 'gravel'", "wa320"]),
     ],
 )
-def test_nonsense_in_a_machine_file_is_refused_by_name(write, text, words):
+def test_nonsense_in_a_machine_file_is_refused_by_name(
+    write: Callable[..., Path], text: str, words: list[str]
+) -> None:
     refused(lambda: machine_named(write(text)), "given.toml", *words)
 
 
-def test_a_name_that_is_none_is_refused(tmp_path):
+def test_a_name_that_is_none_is_refused(tmp_path: Path) -> None:
     refused(lambda: soil_named("sandd"), "'sandd'", "did you mean sand", "clay")
     refused(lambda: soil_named(""), "no such soil")
     refused(lambda: soil_named("a\0b"), "no such soil")
@@ -221,13 +230,16 @@ def test_a_name_that_is_none_is_refused(tmp_path):
 
 @pytest.mark.parametrize("value", [math.nan, -math.inf, -1e9, 1e9])
 @pytest.mark.parametrize(("check", "preset"), [(check_soil, GRAVEL), (check_machine, WA320)])
-def test_every_field_refuses_nonsense_by_its_name(check, preset, value):
+def test_every_field_refuses_nonsense_by_its_name(
+    check: Callable[[Any], None], preset: Soil | WheelLoader, value: float
+) -> None:
     for field in dataclasses.fields(preset):
-        wrong = dataclasses.replace(preset, **{field.name: value})
-        assert refused(lambda w=wrong: check(w)).startswith(f"{field.name} is ")
+        change: dict[str, Any] = {field.name: value}
+        wrong = dataclasses.replace(preset, **change)
+        assert refused(functools.partial(check, wrong)).startswith(f"{field.name} is ")
 
 
-def test_a_world_refuses_what_makes_no_sense():
+def test_a_world_refuses_what_makes_no_sense() -> None:
     with pytest.raises(InputError, match="density is -1"):
         wlplan.load_world("simulator", soil=dataclasses.replace(GRAVEL, density=-1.0))
     with pytest.raises(InputError, match="bucket_width is 9 m"):
@@ -235,9 +247,9 @@ def test_a_world_refuses_what_makes_no_sense():
 
 
 @pytest.mark.parametrize("name", ["simulator", "low"])
-def test_a_world_has_the_soil_and_machine_it_is_given(name):
+def test_a_world_has_the_soil_and_machine_it_is_given(name: str) -> None:
     narrow = dataclasses.replace(WA320, bucket_width=1.8)
-    world = wlplan.load_world(name, soil=SAND, machine=narrow)
+    world: Any = wlplan.load_world(name, soil=SAND, machine=narrow)
     assert (world.soil, world.machine) == (SAND, narrow)
     world = wlplan.load_world(name)
     assert (world.soil, world.machine) == (GRAVEL, WA320)
@@ -246,14 +258,14 @@ def test_a_world_has_the_soil_and_machine_it_is_given(name):
 # --- records
 
 
-def test_a_record_gives_back_what_was_recorded():
+def test_a_record_gives_back_what_was_recorded() -> None:
     for soil in SOILS.values():
         assert soil_recorded(dataclasses.asdict(soil)) == soil
     assert machine_recorded(dataclasses.asdict(WA320)) == WA320
     assert soil_recorded({"density": 1600}) == dataclasses.replace(GRAVEL, density=1600.0)
 
 
-def test_a_record_that_makes_no_sense_is_refused():
+def test_a_record_that_makes_no_sense_is_refused() -> None:
     refused(lambda: soil_recorded(None), "soil")
     refused(lambda: soil_recorded({"density": "1"}), "density")
     refused(lambda: soil_recorded({"friction": 2.0}), "friction is 114.592°")
@@ -264,7 +276,7 @@ def test_a_record_that_makes_no_sense_is_refused():
 
 
 @pytest.fixture(scope="module")
-def loaded():
+def loaded() -> Callable[..., float]:
     """Load [kg] of one cycle on a slope of 28 degrees.
 
     The action goes in as far as it may: one that lifts by force would go deeper with a narrow
@@ -276,8 +288,8 @@ def loaded():
     action = Action(0.2, 1.0, 0.6, 1.5)
 
     @functools.cache
-    def load(soil=GRAVEL, machine=WA320):
-        def play(height):
+    def load(soil: Soil = GRAVEL, machine: WheelLoader = WA320) -> float:
+        def play(height: jax.Array) -> jax.Array:
             return dig(height, jnp.zeros_like(height), action, machine=machine, soil=soil).mass
 
         return float(jax.jit(play)(height))
@@ -285,21 +297,21 @@ def loaded():
     return load
 
 
-def test_denser_soil_means_more_mass(loaded):
+def test_denser_soil_means_more_mass(loaded: Callable[..., float]) -> None:
     heavy = dataclasses.replace(GRAVEL, density=1.2 * GRAVEL.density)
     light = dataclasses.replace(GRAVEL, density=GRAVEL.density / 1.2)
     assert loaded(soil=heavy) > loaded() > loaded(soil=light) > 0.0
 
 
-def test_a_narrower_bucket_loads_less(loaded):
+def test_a_narrower_bucket_loads_less(loaded: Callable[..., float]) -> None:
     narrow = dataclasses.replace(WA320, bucket_width=1.8, bucket_heaped=3.0 * 1.8 / 2.7)
     assert 0.0 < loaded(machine=narrow) < 0.9 * loaded()
 
 
-def test_the_widest_bucket_that_is_let_pass_digs(loaded):
+def test_the_widest_bucket_that_is_let_pass_digs(loaded: Callable[..., float]) -> None:
     widest = dataclasses.replace(WA320, bucket_width=parameters.MAP_WIDTH)
     assert 0.0 < loaded(machine=widest) < 2.0 * loaded()
 
 
-def test_sticky_soil_digs(loaded):
+def test_sticky_soil_digs(loaded: Callable[..., float]) -> None:
     assert 0.0 < loaded(soil=CLAY) < 1.5 * loaded()

@@ -2,6 +2,9 @@
 
 import json
 import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +12,16 @@ import numpy as np
 import pytest
 
 from wlplan import cli
-from wlplan.dataset import VARIABLES, Dataset, probes, probes_of, simulator_changes
+from wlplan.dataset import VARIABLES, Dataset, fingerprint, probes, probes_of, simulator_changes
 from wlplan.errors import InputError
+from wlplan.io.provenance import versions
 from wlplan.models.storage import load_model, read_description
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
-from wlplan.training import train_all, weights
+from wlplan.training import Settings, train_all, weights
 from wlplan.types import action_from
+from wlplan.worlds.learned import LearnedWorld
 from wlplan.worlds.library import load_world, pretrained_path
 from wlplan.worlds.names import WORLDS, Learned
 
@@ -26,12 +31,12 @@ REBUILD = "make them again: `make weights`, or `wlplan train all --data DATA.zar
 
 
 @pytest.fixture(scope="module")
-def data():
+def data() -> list[dict[str, Any]]:
     """What the models say of the data that they were trained on."""
     return [read_description(pretrained_path(kind), kind)["dataset"] for kind in SHIPPED]
 
 
-def test_the_shipped_weights_are_of_todays_simulator(data):
+def test_the_shipped_weights_are_of_todays_simulator(data: list[dict[str, Any]]) -> None:
     # All models share their data, so the cycles are played once.
     assert all(other["fingerprints"] == data[0]["fingerprints"] for other in data), REBUILD
     assert all(other["probes"] == data[0]["probes"] for other in data), REBUILD
@@ -42,7 +47,7 @@ def test_the_shipped_weights_are_of_todays_simulator(data):
     )
 
 
-def test_the_check_can_fail(data, monkeypatch):
+def test_the_check_can_fail(data: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
     some = data[0]["probes"][:1]
     assert not simulator_changes({**data[0], "probes": some})
     for name in ("mass", "time", "work", "moved"):
@@ -56,30 +61,31 @@ def test_the_check_can_fail(data, monkeypatch):
         "the data set had no cycles to compare with"
     ]
     soil = {**data[0]["soil"], "friction": 0.5, "stickiness": 1.0}
-    found = simulator_changes({**data[0], "probes": some, "soil": soil})
-    assert [entry.split()[0] for entry in found] == ["soil.friction", "soil.stickiness"]
+    changes = simulator_changes({**data[0], "probes": some, "soil": soil})
+    assert [entry.split()[0] for entry in changes] == ["soil.friction", "soil.stickiness"]
 
 
-def test_probes_are_of_every_seed_pile(data):
+def test_probes_are_of_every_seed_pile(data: list[dict[str, Any]]) -> None:
     rollouts = [probe["rollout"] for probe in data[0]["probes"]]
     assert sorted(set(rollouts)) == list(range(len(SEED_PILES)))
     assert len(rollouts) == probes._LOADS * len(SEED_PILES)
 
 
-def test_data_of_ones_own_has_no_probes():
+def test_data_of_ones_own_has_no_probes() -> None:
     columns = {name: np.zeros((7, *v.shape), v.dtype) for name, v in VARIABLES.items()}
     assert probes_of(Dataset(**columns, attributes={})) == []
 
 
-def test_all_weights_together_are_small():
+def test_all_weights_together_are_small() -> None:
     files = [path for kind in SHIPPED for path in pretrained_path(kind).rglob("*")]
     assert sum(path.stat().st_size for path in files if path.is_file()) <= 25e6
     assert not [path for path in files if path.suffix in (".pkl", ".pickle")]
 
 
 @pytest.mark.parametrize("name", LEARNED)
-def test_every_learned_world_is_there_and_loads_a_bucket(name):
+def test_every_learned_world_is_there_and_loads_a_bucket(name: str) -> None:
     world = load_world(name)
+    assert isinstance(world, LearnedWorld)
     pile = relax(seed_pile("conical", slope=np.radians(30.0), height=2.5))
     pose = jax.tree.map(lambda leaf: leaf[0], edge_poses(toe_contour(pile), 1))
     action = action_from(jnp.array([0.3, 2.0, 0.2, 3.0]))
@@ -95,14 +101,14 @@ def test_every_learned_world_is_there_and_loads_a_bucket(name):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in SHIPPED if kind.startswith("psi")])
-def test_the_interval_held_what_it_says_on_held_out_cycles(kind):
+def test_the_interval_held_what_it_says_on_held_out_cycles(kind: str) -> None:
     intervals = read_description(pretrained_path(kind), kind)["held_out"]["intervals"]
     for interval in intervals.values():
         assert 0.85 <= interval["coverage"] <= 0.95
 
 
 @pytest.mark.parametrize("kind", SHIPPED)
-def test_a_model_for_another_grid_is_refused_in_one_line(kind, tmp_path):
+def test_a_model_for_another_grid_is_refused_in_one_line(kind: str, tmp_path: Path) -> None:
     copy = shutil.copytree(pretrained_path(kind), tmp_path / kind)
     document = json.loads((copy / "model.json").read_text())
     for change in ({"cell_size": 0.2}, {"state_cells": 64}):
@@ -111,17 +117,23 @@ def test_a_model_for_another_grid_is_refused_in_one_line(kind, tmp_path):
         with pytest.raises(InputError, match=next(iter(change))) as error:
             load_model(copy, kind)
         assert "\n" not in str(error.value)
-    for grid in ("fine", None):
-        (copy / "model.json").write_text(json.dumps({**document, "grid": grid}))
+    for wrong in ("fine", None):
+        (copy / "model.json").write_text(json.dumps({**document, "grid": wrong}))
         with pytest.raises(InputError, match="grid"):
             load_model(copy, kind)
 
 
-def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(tmp_path, monkeypatch):
+def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The trainings themselves have tests of their own."""
-    collected, trained, told = [], [], []
+    collected: list[tuple[str, int, int, str]] = []
+    trained: list[str | tuple[str, int]] = []
+    told: list[tuple[object, ...]] = []
 
-    def collect(path, *, cycles, seed, protocol, progress):
+    def collect(
+        path: Path, *, cycles: int, seed: int, protocol: str, progress: Callable[[int, int], None]
+    ) -> None:
         collected.append((path.name, cycles, seed, protocol))
         progress(cycles, cycles)
 
@@ -134,21 +146,27 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(tmp_path,
     monkeypatch.setattr(weights, "is_new", lambda path: len(collected) < 5)
     monkeypatch.setattr(weights, "read_attributes", lambda path: {"cycles": 1, "cycles_done": 1})
 
-    def train(settings, dataset, *, out, progress):
+    def train(
+        settings: Settings,
+        dataset: Sequence[Dataset],
+        *,
+        out: Path,
+        progress: Callable[[int, int], None],
+    ) -> None:
         if settings.kind == "psi_high" and not trained.count("broke"):
             trained.append("broke")
             raise KeyboardInterrupt
         trained.append((settings.kind, settings.seed))
         shutil.copytree(pretrained_path(settings.kind), out)
         document = json.loads((out / "model.json").read_text())
-        document["dataset"]["fingerprints"] = [weights.fingerprint(each) for each in dataset]
+        document["dataset"]["fingerprints"] = [fingerprint(each) for each in dataset]
         document["training"]["settings"] = settings.as_dict()
-        document["versions"] = weights.versions()
+        document["versions"] = versions()
         (out / "model.json").write_text(json.dumps(document))
         progress(1, 1)
 
     monkeypatch.setattr(weights, "train", train)
-    call = {"seed": 3, "progress": lambda *news: told.append(news)}
+    call: dict[str, Any] = {"seed": 3, "progress": lambda *news: told.append(news)}
     with pytest.raises(KeyboardInterrupt):
         train_all(tmp_path / "d.zarr", tmp_path / "out", **call)
     reports = train_all(tmp_path / "d.zarr", tmp_path / "out", **call)
@@ -169,8 +187,17 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(tmp_path,
     assert trained[4:] == [("psi_low", 4), ("psi_high", 4), ("phi", 4)]
 
 
-def test_what_was_trained_and_what_was_kept_is_told(tmp_path, monkeypatch, capsys):
-    def train_all(data, out, *, seed, epochs, progress):
+def test_what_was_trained_and_what_was_kept_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def train_all(
+        data: str,
+        out: str,
+        *,
+        seed: int,
+        epochs: int | None,
+        progress: Callable[[str, int, int], None],
+    ) -> dict[str, Any]:
         progress("cycles, d.zarr", 10, 10)
         progress("psi_high", 60, 60)
         return {kind: read_description(pretrained_path(kind), kind)["held_out"] for kind in SHIPPED}
@@ -185,5 +212,5 @@ def test_what_was_trained_and_what_was_kept_is_told(tmp_path, monkeypatch, capsy
     assert kept == f"kept, since data, settings and versions are the same: {others}"
 
 
-def test_every_model_that_a_world_needs_is_trained():
+def test_every_model_that_a_world_needs_is_trained() -> None:
     assert {settings.kind for settings in weights.SHIPPED} == set(SHIPPED)

@@ -1,5 +1,8 @@
 """Laws of ψ_high: encoders, finite gradients on flat ground, training, its worlds."""
 
+from pathlib import Path
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +21,7 @@ from wlplan.site.soil import GRAVEL
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
-from wlplan.training import PsiHighSettings, train
+from wlplan.training import EvaluationReport, PsiHighSettings, train
 from wlplan.types import LocalHeightmap, action_from
 from wlplan.worlds.library import load_world
 
@@ -28,7 +31,9 @@ OUT = np.array([[0.1, 6.0, 110.0], [4.8, 21.0, 1390.0]], np.float32)
 ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
 
 
-def model_of(encoder="principal", activation="swish", seed=0):
+def model_of(
+    encoder: str = "principal", activation: str = "swish", seed: int = 0
+) -> HighPerformanceModel:
     network = PsiHigh((32, 32), encoder=encoder, activation=activation, rngs=nnx.Rngs(seed))
     maps = jnp.stack([surface(k, 0.2 + 0.05 * k) for k in range(8)])
     random = np.random.default_rng(0)
@@ -44,13 +49,15 @@ def model_of(encoder="principal", activation="swish", seed=0):
     return HighPerformanceModel(params=params, graph=graph, **normalisers)
 
 
-def surface(seed=0, slope=0.6):
+def surface(seed: int = 0, slope: float = 0.6) -> jax.Array:
     x = np.linspace(0.0, 3.5, 36)
     rough = np.random.default_rng(seed).normal(0.0, 0.05, (36, 36))
     return jnp.asarray((slope * x[:, None] + rough).astype(np.float32))
 
 
-def performance(model, height, action=ACTION):
+def performance(
+    model: HighPerformanceModel, height: jax.Array, action: jax.Array = ACTION
+) -> jax.Array:
     p = model(LocalHeightmap(height, 0.1, 0.0), action)
     return jnp.stack([p.mass, p.time, p.work])
 
@@ -58,7 +65,7 @@ def performance(model, height, action=ACTION):
 # --- layers
 
 
-def test_patches_and_a_matrix_product_are_a_convolution():
+def test_patches_and_a_matrix_product_are_a_convolution() -> None:
     random = np.random.default_rng(0)
     maps = jnp.asarray(random.normal(size=(5, 8, 8, 3)), jnp.float32)
     kernel = jnp.asarray(random.normal(size=(3, 3, 3, 4)), jnp.float32)
@@ -70,21 +77,21 @@ def test_patches_and_a_matrix_product_are_a_convolution():
     np.testing.assert_allclose(jnp.moveaxis(got, (0, 3), (3, 0)), wanted, atol=1e-4)
 
 
-def test_pooling_takes_the_largest_and_shares_the_gradient_of_equals():
+def test_pooling_takes_the_largest_and_shares_the_gradient_of_equals() -> None:
     maps = jnp.arange(16.0).reshape(1, 4, 4, 1)
     np.testing.assert_array_equal(max_pool(maps).ravel(), [5.0, 7.0, 13.0, 15.0])
     slope = jax.grad(lambda m: max_pool(m).sum())(jnp.zeros((1, 2, 2, 1)))
     np.testing.assert_allclose(slope.ravel(), 0.25)
 
 
-def test_resizing_keeps_planes_and_corners():
+def test_resizing_keeps_planes_and_corners() -> None:
     x, y = np.meshgrid(np.linspace(0, 1, 36), np.linspace(0, 1, 36), indexing="ij")
     small = resize(jnp.asarray(2.0 * x - y, jnp.float32), 32)
     x, y = np.meshgrid(np.linspace(0, 1, 32), np.linspace(0, 1, 32), indexing="ij")
     np.testing.assert_allclose(small, 2.0 * x - y, atol=1e-6)
 
 
-def test_components_of_mirrored_maps_are_the_same_or_opposite():
+def test_components_of_mirrored_maps_are_the_same_or_opposite() -> None:
     maps = jnp.stack([surface(seed, 0.3 + 0.02 * seed) for seed in range(20)])
     encoder = PrincipalComponents()
     encoder.fit(maps)
@@ -100,7 +107,7 @@ def test_components_of_mirrored_maps_are_the_same_or_opposite():
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_the_special_model_of_the_paper_has_its_size(activation):
+def test_the_special_model_of_the_paper_has_its_size(activation: str) -> None:
     network = nnx.eval_shape(lambda: PsiHigh((2048, 2048), activation=activation, rngs=nnx.Rngs(0)))
     count = sum(leaf.size for leaf in jax.tree.leaves(nnx.state(network, nnx.Param)))
     convolutions = (9 + 1) * 10 + 2 * (90 + 1) * 10 + 3 * 20
@@ -109,7 +116,7 @@ def test_the_special_model_of_the_paper_has_its_size(activation):
 
 
 @pytest.mark.parametrize("encoder", ENCODERS)
-def test_a_batch_equals_its_members(encoder):
+def test_a_batch_equals_its_members(encoder: str) -> None:
     model = model_of(encoder)
     heights = jnp.stack([surface(seed) for seed in range(4)])
     batch = jax.jit(jax.vmap(lambda h: performance(model, h)))(heights)
@@ -117,7 +124,7 @@ def test_a_batch_equals_its_members(encoder):
     np.testing.assert_allclose(batch, single, rtol=2e-4)
 
 
-def test_norms_follow_the_batch_in_training_alone():
+def test_norms_follow_the_batch_in_training_alone() -> None:
     network = PsiHigh((8,), rngs=nnx.Rngs(0))
     maps, inputs = jnp.stack([surface(0), surface(1)]), jnp.full((2, 8), 0.5)
     before = jax.tree.leaves(nnx.state(network, nnx.BatchStat))
@@ -131,7 +138,9 @@ def test_norms_follow_the_batch_in_training_alone():
 
 @pytest.mark.parametrize("encoder", ENCODERS)
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_the_gradient_is_finite_on_flat_ground_and_finds_the_action(encoder, activation):
+def test_the_gradient_is_finite_on_flat_ground_and_finds_the_action(
+    encoder: str, activation: str
+) -> None:
     model = model_of(encoder, activation)
     for height in (jnp.zeros((36, 36)), jnp.full((36, 36), 1e6), surface()):
         by_height, by_action = jax.jacrev(lambda h, a: performance(model, h, a), (0, 1))(
@@ -144,13 +153,13 @@ def test_the_gradient_is_finite_on_flat_ground_and_finds_the_action(encoder, act
 
 
 @pytest.mark.parametrize("encoder", ENCODERS)
-def test_the_gradient_agrees_with_finite_differences(encoder):
+def test_the_gradient_agrees_with_finite_differences(encoder: str) -> None:
     with jax.enable_x64(True):
         model = model_of(encoder)
         height = jnp.asarray(surface(), jnp.float64)
         along = jnp.asarray(np.random.default_rng(3).normal(0.0, 0.1, (36, 36)))
 
-        def mass(t):
+        def mass(t: jax.Array) -> jax.Array:
             return performance(model, height + t * along, ACTION.astype(jnp.float64))[0]
 
         slope = jax.grad(mass)(jnp.asarray(0.0))
@@ -159,7 +168,7 @@ def test_the_gradient_agrees_with_finite_differences(encoder):
         assert float(slope) == pytest.approx(float(wanted), rel=1e-4)
 
 
-def test_wrong_maps_and_architectures_are_refused():
+def test_wrong_maps_and_architectures_are_refused() -> None:
     with pytest.raises(InputError, match="cells=36"):
         performance(model_of(), jnp.zeros((52, 52)))
     with pytest.raises(InputError, match="encoder"):
@@ -169,7 +178,7 @@ def test_wrong_maps_and_architectures_are_refused():
 # --- training and worlds
 
 
-def cycles(rollouts=40, loads=8, seed=0):
+def cycles(rollouts: int = 40, loads: int = 8, seed: int = 0) -> Dataset:
     """Cycles whose mass follows from a part of the map that no mean of it tells."""
     n = rollouts * loads
     random = np.random.default_rng(seed)
@@ -190,16 +199,17 @@ def cycles(rollouts=40, loads=8, seed=0):
     return Dataset(**columns, attributes={})
 
 
-SETTINGS = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
+SETTINGS: dict[str, Any] = {"hidden": (32,), "batch": 32, "dropout": 0.0, "learning_rate": 1e-2}
 
 
-def test_training_reads_the_map_and_a_model_comes_back_bit_by_bit(tmp_path):
+def test_training_reads_the_map_and_a_model_comes_back_bit_by_bit(tmp_path: Path) -> None:
     data = cycles()
     model, report = train(PsiHighSettings(epochs=20, **SETTINGS), data, out=tmp_path / "m")
+    assert isinstance(report, EvaluationReport)
     # Without the map nothing is known: the mean would be 11 % off.
     assert report.every.mean_relative["mass"] < 0.06
     loaded = load_model(tmp_path / "m", "psi_high")
-    assert jax.tree.structure(loaded) == jax.tree.structure(model)
+    assert jax.tree.structure(loaded) == jax.tree.structure(model)  # type: ignore[operator]
     for got, want in zip(jax.tree.leaves(loaded), jax.tree.leaves(model), strict=True):
         np.testing.assert_array_equal(got, want)
     assert [path.name for path in tmp_path.iterdir()] == ["m"]
@@ -216,6 +226,8 @@ def test_training_reads_the_map_and_a_model_comes_back_bit_by_bit(tmp_path):
 
 
 @pytest.mark.parametrize("encoder", ENCODERS)
-def test_a_killed_training_ends_with_the_same_weights(encoder, tmp_path, monkeypatch):
+def test_a_killed_training_ends_with_the_same_weights(
+    encoder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     settings = PsiHighSettings(**(SETTINGS | {"encoder": encoder, "dropout": 0.1, "epochs": 4}))
     check_that_a_killed_one_ends_alike(cycles(rollouts=12), tmp_path, monkeypatch, settings, seed=1)

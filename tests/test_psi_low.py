@@ -1,6 +1,7 @@
 """Laws of the performance predictor: positive, bounded, finite gradients, alike in every mode."""
 
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance import INPUTS, OUTPUTS
 from wlplan.models.psi_low import LowPerformanceModel, PsiLow
 from wlplan.terrain.characteristics import as_vector, characteristics
-from wlplan.types import LocalHeightmap
+from wlplan.types import LocalHeightmap, Performance
 
 LOW = np.array([0.2, 0.0, -0.3, -0.2, 0.0, 0.0, 0.0, 0.0], np.float32)
 HIGH = np.array([0.6, 1.5, 0.3, 0.4, 0.7, 5.0, 0.7, 5.0], np.float32)
@@ -23,38 +24,41 @@ OUT_LOW = np.array([0.3, 6.5, 120.0], np.float32)
 OUT_HIGH = np.array([4.8, 19.5, 1300.0], np.float32)
 
 
-def model_of(seed=0, hidden=(32, 32), **settings):
+def model_of(
+    seed: int = 0, hidden: tuple[int, ...] = (32, 32), **settings: Any
+) -> LowPerformanceModel:
     graph, params = nnx.split(PsiLow(hidden, rngs=nnx.Rngs(seed), **settings))
     # Large output weights, so that the untrained network asks for negative loads too.
-    params["output"]["kernel"][...] = 20.0 * params["output"]["kernel"][...]
+    output: Any = params["output"]
+    output["kernel"][...] = 20.0 * output["kernel"][...]
     inputs, outputs = (Normaliser.of(np.stack(rows)) for rows in ((LOW, HIGH), (OUT_LOW, OUT_HIGH)))
     return LowPerformanceModel(params, inputs, outputs, graph)
 
 
-def inputs_of(count, seed=0, wild=0.0):
+def inputs_of(count: int, seed: int = 0, wild: float = 0.0) -> tuple[jax.Array, jax.Array]:
     unit = np.random.default_rng(seed).uniform(-wild, 1.0 + wild, (count, INPUTS))
     values = (LOW + (HIGH - LOW) * unit).astype(np.float32)
     return jnp.asarray(values[:, :4]), jnp.asarray(values[:, 4:])
 
 
-def as_rows(performance):
+def as_rows(performance: Performance) -> jax.Array:
     return jnp.stack(jax.tree.leaves(performance), axis=-1)
 
 
-def total(model, characteristics, action):
+def total(model: LowPerformanceModel, characteristics: jax.Array, action: jax.Array) -> jax.Array:
     p = model.of_view(characteristics, action)
     return p.mass / 3.0 + p.time / 10.0 + p.work / 400.0
 
 
 @pytest.fixture(scope="module")
-def model():
+def model() -> LowPerformanceModel:
     return model_of()
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("hidden", [(8,), (16, 8), (8, 8, 8)])
-def test_the_architectures_of_the_grid_search(hidden, activation):
-    def build():
+def test_the_architectures_of_the_grid_search(hidden: tuple[int, ...], activation: str) -> None:
+    def build() -> PsiLow:
         return PsiLow(hidden, activation=activation, rngs=nnx.Rngs(0))
 
     assert jax.eval_shape(lambda: build()(jnp.zeros((5, INPUTS)))).shape == (5, OUTPUTS)
@@ -63,7 +67,7 @@ def test_the_architectures_of_the_grid_search(hidden, activation):
     assert sizes == sum((n + 1) * m for n, m in itertools.pairwise(widths))
 
 
-def test_dropout_acts_in_training_alone():
+def test_dropout_acts_in_training_alone() -> None:
     network = PsiLow((64,), rngs=nnx.Rngs(0))
     x = jnp.ones(INPUTS)
     np.testing.assert_array_equal(network(x), network(x))
@@ -74,13 +78,13 @@ def test_dropout_acts_in_training_alone():
 @pytest.mark.parametrize(
     "settings", [{"activation": "tanh"}, {"hidden": ()}, {"hidden": (0,)}, {"dropout": 1.0}]
 )
-def test_an_architecture_without_sense_is_refused(settings):
+def test_an_architecture_without_sense_is_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(InputError) as error:
         PsiLow(rngs=nnx.Rngs(0), **settings)
     assert "\n" not in str(error.value)
 
 
-def test_a_batch_equals_its_members(model):
+def test_a_batch_equals_its_members(model: LowPerformanceModel) -> None:
     characteristics, action = inputs_of(7)
     batch = jax.jit(jax.vmap(model.of_view))(characteristics, action)
     single = [model.of_view(c, a) for c, a in zip(characteristics, action, strict=True)]
@@ -89,32 +93,33 @@ def test_a_batch_equals_its_members(model):
     )
 
 
-def test_a_model_is_a_pytree_that_passes_through_jit(model):
+def test_a_model_is_a_pytree_that_passes_through_jit(model: LowPerformanceModel) -> None:
     characteristics, action = inputs_of(1)
     call = jax.jit(lambda m, c, a: m.of_view(c, a))
     first = call(model, characteristics[0], action[0])
     call(model_of(seed=1), characteristics[0], action[0])
-    assert call._cache_size() == 1  # other weights are no other program
+    # Other weights are no other program.
+    assert call._cache_size() == 1  # type: ignore[attr-defined]
     np.testing.assert_allclose(
         as_rows(first), as_rows(model.of_view(characteristics[0], action[0])), rtol=1e-5
     )
 
 
 @pytest.mark.parametrize("wild", [0.0, 1.0, 100.0, 1e6])
-def test_outcomes_are_positive_and_finite(model, wild):
+def test_outcomes_are_positive_and_finite(model: LowPerformanceModel, wild: float) -> None:
     rows = np.asarray(as_rows(jax.vmap(model.of_view)(*inputs_of(300, wild=wild))))
     assert np.all(np.isfinite(rows))
     assert np.all(rows >= 0.001 * (OUT_HIGH - OUT_LOW))
 
 
-def test_far_out_the_network_promises_nothing_new(model):
+def test_far_out_the_network_promises_nothing_new(model: LowPerformanceModel) -> None:
     sides = np.random.default_rng(0).choice([-1.0, 1.0], (50, INPUTS))
     far, farther = ((LOW + out * (HIGH - LOW) * sides).astype(np.float32) for out in (1e2, 1e6))
     rows = [as_rows(jax.vmap(model.of_view)(x[:, :4], x[:, 4:])) for x in (far, farther)]
-    np.testing.assert_allclose(*rows, rtol=1e-5)
+    np.testing.assert_allclose(rows[0], rows[1], rtol=1e-5)
 
 
-def test_the_network_does_ask_for_negative_loads(model):
+def test_the_network_does_ask_for_negative_loads(model: LowPerformanceModel) -> None:
     """Otherwise the test above would not test the floor."""
     characteristics, action = inputs_of(300)
     unit = jax.vmap(model.inputs.normalise)(jnp.concatenate([characteristics, action], axis=1))
@@ -122,17 +127,18 @@ def test_the_network_does_ask_for_negative_loads(model):
     assert np.any(jax.vmap(model.outputs.denormalise)(network(unit)) < 0.0)
 
 
-def test_the_floor_leaves_the_range_of_the_data_alone():
+def test_the_floor_leaves_the_range_of_the_data_alone() -> None:
     params = model_of().params
-    params["output"]["kernel"][...] = 0.0 * params["output"]["kernel"][...]
-    params["output"]["bias"][...] = jnp.array([0.5, 0.0, 1.0])
+    output: Any = params["output"]
+    output["kernel"][...] = 0.0 * output["kernel"][...]
+    output["bias"][...] = jnp.array([0.5, 0.0, 1.0])
     flat = model_of().replace(params=params)
     rows = as_rows(flat.of_view(*(part[0] for part in inputs_of(1))))
     np.testing.assert_allclose(rows, [2.55, 6.5, 1300.0], rtol=1e-3)
 
 
 @pytest.mark.parametrize("wild", [0.0, 1.0, 1e6])
-def test_gradients_are_finite_everywhere(model, wild):
+def test_gradients_are_finite_everywhere(model: LowPerformanceModel, wild: float) -> None:
     gradient = jax.jit(jax.vmap(jax.grad(total, argnums=(1, 2)), in_axes=(None, 0, 0)))
     for part in gradient(model, *inputs_of(200, wild=wild)):
         assert np.all(np.isfinite(part))
@@ -142,13 +148,13 @@ def test_gradients_are_finite_everywhere(model, wild):
         assert np.all(np.any(part != 0.0, axis=1))
 
 
-def test_gradients_equal_finite_differences_in_float64(model):
+def test_gradients_equal_finite_differences_in_float64(model: LowPerformanceModel) -> None:
     with jax.enable_x64(True):
         characteristics, action = (np.asarray(v, np.float64)[:5] for v in inputs_of(5))
         model = model_of()
 
         @jax.jit
-        def f(both):
+        def f(both: jax.Array) -> jax.Array:
             return total(model, both[:4], both[4:])
 
         reverse_mode, forward_mode = jax.jit(jax.grad(f)), jax.jit(jax.jacfwd(f))
@@ -162,7 +168,7 @@ def test_gradients_equal_finite_differences_in_float64(model):
             np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-7)
 
 
-def test_a_local_heightmap_is_seen_by_its_characteristics(model):
+def test_a_local_heightmap_is_seen_by_its_characteristics(model: LowPerformanceModel) -> None:
     rise = np.broadcast_to(0.05 * np.arange(36.0)[:, None], (36, 36)).astype(np.float32)
     local = LocalHeightmap(jnp.asarray(rise), 0.1, 0.0)
     action = inputs_of(1)[1][0]
@@ -176,7 +182,7 @@ def test_a_local_heightmap_is_seen_by_its_characteristics(model):
             model(wrong, action)
 
 
-def test_the_soft_clamp_is_the_identity_inside_and_smooth_at_the_border():
+def test_the_soft_clamp_is_the_identity_inside_and_smooth_at_the_border() -> None:
     inside = jnp.linspace(0.0, 1.0, 11)
     np.testing.assert_array_equal(soft_clamp(inside), inside)
     far = soft_clamp(jnp.array([-1e9, -10.0, 10.0, 1e9]))

@@ -5,8 +5,10 @@ import math
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,15 +20,16 @@ from wlplan.errors import InputError
 from wlplan.io import readers
 from wlplan.io.readers import find_reader, known_endings, register_reader
 from wlplan.terrain.seed_piles import seed_pile
+from wlplan.types import Pile
 
 
 @pytest.fixture
-def pile():
+def pile() -> Pile:
     return seed_pile("conical", slope=math.radians(30.0), height=2.0, seed=1)
 
 
 @pytest.fixture
-def fields(pile):
+def fields(pile: Pile) -> dict[str, Any]:
     """What a valid .npz holds."""
     return {"height": np.asarray(pile.height), "cell_size": 0.1, "origin": np.asarray(pile.origin)}
 
@@ -36,14 +39,16 @@ def fields(pile):
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"not a zip at all", bytes(1000)])
 @pytest.mark.parametrize("ending", known_endings())
-def test_files_of_something_else_are_refused(tmp_path, content, ending, capfd):
+def test_files_of_something_else_are_refused(
+    tmp_path: Path, content: bytes, ending: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / f"pile{ending}"
     path.write_bytes(content)
     refused(path, "pile")
     assert capfd.readouterr() == ("", "")
 
 
-def damaged(content, random):
+def damaged(content: bytes, random: np.random.Generator) -> Iterator[bytes]:
     """Copies of a file that are cut short or have some bytes changed."""
     for share in (0.1, 0.5, 0.9, 0.99):
         yield content[: int(share * len(content))]
@@ -59,7 +64,7 @@ def damaged(content, random):
         yield bytes(changed)
 
 
-def outcome(path):
+def outcome(path: Path) -> str:
     """Return "read", or the message that a pile was refused with; anything else fails the test."""
     try:
         io.read_pile(path)
@@ -68,7 +73,7 @@ def outcome(path):
     return "read"
 
 
-def check_damage(path, capfd):
+def check_damage(path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     content = path.read_bytes()
     outcomes = []
     for broken in damaged(content, np.random.default_rng(0)):
@@ -82,13 +87,15 @@ def check_damage(path, capfd):
 # --- npz
 
 
-def test_a_single_array_is_refused(tmp_path, fields):
+def test_a_single_array_is_refused(tmp_path: Path, fields: dict[str, Any]) -> None:
     with (tmp_path / "pile.npz").open("wb") as file:
         np.save(file, fields["height"])
     refused(tmp_path / "pile.npz", "single array")
 
 
-def test_damaged_npz_files_are_refused_or_read_but_never_crash(tmp_path, fields, capfd):
+def test_damaged_npz_files_are_refused_or_read_but_never_crash(
+    tmp_path: Path, fields: dict[str, Any], capfd: pytest.CaptureFixture[str]
+) -> None:
     fields["height"] = fields["height"][20:80, 20:80]
     np.savez_compressed(tmp_path / "pile.npz", **fields)
     check_damage(tmp_path / "pile.npz", capfd)
@@ -97,7 +104,7 @@ def test_damaged_npz_files_are_refused_or_read_but_never_crash(tmp_path, fields,
 # --- GeoTIFF
 
 
-def test_geotiff_rows_run_from_north_to_south(tmp_path, pile):
+def test_geotiff_rows_run_from_north_to_south(tmp_path: Path, pile: Pile) -> None:
     height = np.asarray(pile.height)
     height = height + 0.001 * np.arange(height.shape[1])  # not the same in x and y
     west, south = 100.0, 200.0
@@ -109,7 +116,7 @@ def test_geotiff_rows_run_from_north_to_south(tmp_path, pile):
     assert again.valid is None
 
 
-def test_geotiff_that_runs_from_south_to_north(tmp_path, pile):
+def test_geotiff_that_runs_from_south_to_north(tmp_path: Path, pile: Pile) -> None:
     rasterio = pytest.importorskip("rasterio")
     band = np.asarray(pile.height)
     upward = rasterio.Affine(0.1, 0.0, 100.0, 0.0, 0.1, 200.0)
@@ -118,7 +125,7 @@ def test_geotiff_that_runs_from_south_to_north(tmp_path, pile):
     np.testing.assert_allclose(again.origin, [100.05, 200.05], atol=1e-4)
 
 
-def test_geotiff_nodata_and_nan_are_unseen(tmp_path, pile):
+def test_geotiff_nodata_and_nan_are_unseen(tmp_path: Path, pile: Pile) -> None:
     band = np.asarray(pile.height).T.copy()
     band[10, 20:30], band[12, 5] = -9999.0, np.nan
     again = io.read_pile(write_tif(tmp_path / "pile.tif", band, nodata=-9999.0))
@@ -126,7 +133,7 @@ def test_geotiff_nodata_and_nan_are_unseen(tmp_path, pile):
     assert float(again.height.min()) == 0.0
 
 
-def test_geotiff_in_survey_coordinates(tmp_path, pile):
+def test_geotiff_in_survey_coordinates(tmp_path: Path, pile: Pile) -> None:
     band = np.asarray(pile.height).T + np.float32(64.0)
     path = write_tif(tmp_path / "p.tif", band, west=431_000.0, north=6_512_900.0, crs="EPSG:32633")
     again = io.read_pile(path)
@@ -145,14 +152,18 @@ def test_geotiff_in_survey_coordinates(tmp_path, pile):
     ],
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_geotiffs_without_square_metric_cells_are_refused(tmp_path, pile, options, match):
+def test_geotiffs_without_square_metric_cells_are_refused(
+    tmp_path: Path, pile: Pile, options: dict[str, Any], match: str
+) -> None:
     rasterio = pytest.importorskip("rasterio")
     if "transform" in options:
         options = {**options, "transform": rasterio.Affine(*options["transform"])}
     refused(write_tif(tmp_path / "pile.tif", np.asarray(pile.height), **options), match)
 
 
-def test_damaged_geotiffs_are_refused_or_read_but_never_crash(tmp_path, pile, capfd):
+def test_damaged_geotiffs_are_refused_or_read_but_never_crash(
+    tmp_path: Path, pile: Pile, capfd: pytest.CaptureFixture[str]
+) -> None:
     write_tif(tmp_path / "pile.tif", np.asarray(pile.height)[20:80, 20:80], compress="deflate")
     check_damage(tmp_path / "pile.tif", capfd)
 
@@ -161,7 +172,7 @@ def test_damaged_geotiffs_are_refused_or_read_but_never_crash(tmp_path, pile, ca
 
 
 @pytest.mark.parametrize("ending", [".las", ".laz", ".ply"])
-def test_point_clouds_are_gridded(tmp_path, pile, ending):
+def test_point_clouds_are_gridded(tmp_path: Path, pile: Pile, ending: str) -> None:
     points = points_of(pile, np.random.default_rng(0))
     write = write_ply if ending == ".ply" else write_las
     again = io.read_pile(write(tmp_path / f"pile{ending}", points))
@@ -176,14 +187,14 @@ def test_point_clouds_are_gridded(tmp_path, pile, ending):
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_ply_encodings_read_alike(tmp_path, pile, encoding):
+def test_ply_encodings_read_alike(tmp_path: Path, pile: Pile, encoding: str) -> None:
     points = points_of(pile, np.random.default_rng(0), 20_000)
     want = io.read_pile(write_ply(tmp_path / "a.ply", points))
     again = io.read_pile(write_ply(tmp_path / "b.ply", points, encoding))
     np.testing.assert_allclose(again.height, want.height, atol=2e-3)
 
 
-def test_cells_without_points_are_unseen_and_filled(tmp_path, pile):
+def test_cells_without_points_are_unseen_and_filled(tmp_path: Path, pile: Pile) -> None:
     points = points_of(pile, np.random.default_rng(0), 200_000)
     hole = np.hypot(points[:, 0] - 1.0, points[:, 1]) < 0.8
     again = io.read_pile(write_ply(tmp_path / "pile.ply", points[~hole]))
@@ -191,14 +202,14 @@ def test_cells_without_points_are_unseen_and_filled(tmp_path, pile):
     assert np.isfinite(again.height).all()
 
 
-def test_the_median_of_a_cell_ignores_a_bird(tmp_path, pile):
+def test_the_median_of_a_cell_ignores_a_bird(tmp_path: Path, pile: Pile) -> None:
     points = points_of(pile, np.random.default_rng(0), 100_000)
     points[7, 2] += 30.0
     again = io.read_pile(write_ply(tmp_path / "pile.ply", points))
     assert float(again.height.max()) < 3.0
 
 
-def test_a_sparse_cloud_is_gridded_by_its_spacing(tmp_path, pile):
+def test_a_sparse_cloud_is_gridded_by_its_spacing(tmp_path: Path, pile: Pile) -> None:
     points = points_of(pile, np.random.default_rng(0), 1500)
     again = io.read_pile(write_ply(tmp_path / "pile.ply", points))
     assert again.cell_size == 0.1
@@ -218,27 +229,33 @@ def test_a_sparse_cloud_is_gridded_by_its_spacing(tmp_path, pile):
         (b"vertex 9000", b"vertex 0", "three points"),
     ],
 )
-def test_bad_ply_headers_are_refused(tmp_path, pile, old, new, match):
+def test_bad_ply_headers_are_refused(
+    tmp_path: Path, pile: Pile, old: bytes, new: bytes, match: str
+) -> None:
     path = write_ply(tmp_path / "pile.ply", points_of(pile, np.random.default_rng(0), 9000))
     path.write_bytes(path.read_bytes().replace(old, new, 1))
     refused(path, match)
 
 
-def test_a_cloud_with_a_point_far_off_is_refused(tmp_path, pile):
+def test_a_cloud_with_a_point_far_off_is_refused(tmp_path: Path, pile: Pile) -> None:
     points = points_of(pile, np.random.default_rng(0), 9000)
     points[0, 0] = 5000.0
     refused(write_ply(tmp_path / "pile.ply", points), "crop it")
 
 
 @pytest.mark.parametrize("ending", [".las", ".laz", ".ply"])
-def test_damaged_point_clouds_are_refused_or_read_but_never_crash(tmp_path, pile, ending, capfd):
+def test_damaged_point_clouds_are_refused_or_read_but_never_crash(
+    tmp_path: Path, pile: Pile, ending: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     points = points_of(pile, np.random.default_rng(0), 3000)
     write = write_ply if ending == ".ply" else write_las
     check_damage(write(tmp_path / f"pile{ending}", points), capfd)
 
 
 @pytest.mark.parametrize(("ending", "module"), [(".tif", "rasterio"), (".laz", "laspy")])
-def test_a_missing_reader_says_what_to_install(tmp_path, monkeypatch, ending, module):
+def test_a_missing_reader_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, module: str
+) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     path = tmp_path / f"pile{ending}"
     path.write_bytes(b"x")
@@ -251,7 +268,7 @@ ROOT = Path(__file__).parents[1]
 MODULES = sorted(path.stem for path in (ROOT / "wlplan/io/readers").glob("[!_]*.py"))
 
 
-def in_a_process(code, path):
+def in_a_process(code: str, path: Path) -> str:
     """What a fresh interpreter prints that finds modules and packages in a folder, too."""
     done = subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path[:0] = {[str(ROOT), str(path)]}; {code}"],
@@ -263,7 +280,7 @@ def in_a_process(code, path):
     return done.stdout.strip()
 
 
-def test_every_reader_declares_its_endings_and_no_two_the_same():
+def test_every_reader_declares_its_endings_and_no_two_the_same() -> None:
     modules = [importlib.import_module(f"wlplan.io.readers.{name}") for name in MODULES]
     endings = [ending for module in modules for ending in module.ENDINGS]
     assert len(modules) >= 4
@@ -276,7 +293,7 @@ def test_every_reader_declares_its_endings_and_no_two_the_same():
             assert find_reader(Path(f"PILE{ending.upper()}")) is module
 
 
-def test_endings_are_told_without_the_libraries_of_the_formats_or_jax(tmp_path):
+def test_endings_are_told_without_the_libraries_of_the_formats_or_jax(tmp_path: Path) -> None:
     """Of what is no part of Python, only numpy may be imported."""
     code = (
         "before = set(sys.modules); from wlplan.io import readers; readers.known_endings(); "
@@ -286,13 +303,13 @@ def test_endings_are_told_without_the_libraries_of_the_formats_or_jax(tmp_path):
     assert in_a_process(code, tmp_path) == "[]"
 
 
-EXAMPLE = re.search(
+(EXAMPLE,) = re.findall(
     r"## Your own reader\n.*?```python\n(.*?)```", (ROOT / "docs/extending.md").read_text(), re.S
-).group(1)
+)
 
 
 @pytest.fixture
-def xyz(tmp_path, monkeypatch):
+def xyz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The example of the documentation as a module that can be imported, its name on the path."""
     folder = tmp_path / "theirs"
     folder.mkdir()
@@ -303,7 +320,7 @@ def xyz(tmp_path, monkeypatch):
     return folder
 
 
-def offer(folder, package, *lines):
+def offer(folder: Path, package: str, *lines: str) -> None:
     """Let a folder look like one that a package with entry points was installed into."""
     info = folder / f"{package}-1.0.dist-info"
     info.mkdir()
@@ -312,12 +329,14 @@ def offer(folder, package, *lines):
     (info / "entry_points.txt").write_text(text)
 
 
-def write_xyz(path, points):
+def write_xyz(path: Path, points: np.ndarray) -> Path:
     np.savetxt(path, points, "%.4f", header="x y z", comments="# ")
     return path
 
 
-def test_the_documented_reader_reads_a_cloud_once_it_is_registered(tmp_path, pile, xyz):
+def test_the_documented_reader_reads_a_cloud_once_it_is_registered(
+    tmp_path: Path, pile: Pile, xyz: Path
+) -> None:
     points = points_of(pile, np.random.default_rng(0), 20_000)
     path = write_xyz(tmp_path / "pile.xyz", points)
     refused(path, r"unknown kind of pile file '\.xyz'")
@@ -333,7 +352,7 @@ def test_the_documented_reader_reads_a_cloud_once_it_is_registered(tmp_path, pil
     refused(path, r"cannot be read as \.xyz")
 
 
-def test_the_documented_reader_comes_with_a_package(tmp_path, pile, xyz):
+def test_the_documented_reader_comes_with_a_package(tmp_path: Path, pile: Pile, xyz: Path) -> None:
     offer(xyz, "theirs", "xyz = their_xyz")
     path = write_xyz(tmp_path / "pile.xyz", points_of(pile, np.random.default_rng(0), 2000))
     assert ".xyz" in known_endings()
@@ -351,21 +370,23 @@ def test_the_documented_reader_comes_with_a_package(tmp_path, pile, xyz):
         (["xyz = their_xyz:ENDINGS"], "tuple is no reader"),
     ],
 )
-def test_a_package_with_a_broken_reader_is_named(tmp_path, fields, xyz, lines, match):
+def test_a_package_with_a_broken_reader_is_named(
+    tmp_path: Path, fields: dict[str, Any], xyz: Path, lines: list[str], match: str
+) -> None:
     offer(xyz, "theirs", *lines)
     (tmp_path / "pile.xyz").write_text("1 2 3")
     refused(tmp_path / "pile.xyz", match)
     io.read_pile(save(tmp_path / "pile.npz", fields))  # all others are read as ever
 
 
-def test_two_packages_for_one_ending_are_refused(tmp_path, xyz):
+def test_two_packages_for_one_ending_are_refused(tmp_path: Path, xyz: Path) -> None:
     offer(xyz, "theirs", "xyz = their_xyz")
     offer(xyz, "others", "XYZ = others_xyz")
     (tmp_path / "pile.xyz").write_text("1 2 3")
     refused(tmp_path / "pile.xyz", "others_xyz and their_xyz both read .xyz")
 
 
-def reader(*endings, read=lambda path: None, **names):
+def reader(*endings: object, read: object = lambda path: None, **names: Any) -> SimpleNamespace:
     return SimpleNamespace(__name__="mine", ENDINGS=endings, read=read, **names)
 
 
@@ -382,7 +403,9 @@ def reader(*endings, read=lambda path: None, **names):
         (reader(".xyz", ".ply"), r"mine reads \.ply, as wlplan\.io\.readers\.ply does already"),
     ],
 )
-def test_what_is_no_reader_is_not_registered(monkeypatch, candidate, match):
+def test_what_is_no_reader_is_not_registered(
+    monkeypatch: pytest.MonkeyPatch, candidate: Any, match: str
+) -> None:
     monkeypatch.setattr(readers, "_registered", {})
     with pytest.raises(InputError, match=match):
         register_reader(candidate)
@@ -390,14 +413,18 @@ def test_what_is_no_reader_is_not_registered(monkeypatch, candidate, match):
 
 
 @pytest.mark.parametrize("points", [np.zeros((5, 2)), np.zeros(3), np.full((5, 3), "a")])
-def test_points_that_are_no_points_are_refused(tmp_path, monkeypatch, points):
+def test_points_that_are_no_points_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: np.ndarray
+) -> None:
     monkeypatch.setattr(readers, "_registered", {})
     register_reader(reader(".xyz", read=lambda path: io.PointCloud(points)))
     (tmp_path / "pile.xyz").write_text("")
     refused(tmp_path / "pile.xyz", "`points`")
 
 
-def test_a_reader_that_returns_something_else_is_a_fault_of_its_own(tmp_path, monkeypatch):
+def test_a_reader_that_returns_something_else_is_a_fault_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(readers, "_registered", {})
     register_reader(reader(".xyz"))
     (tmp_path / "pile.xyz").write_text("")

@@ -1,11 +1,14 @@
 """Rollouts: laws with a fake world, then the shipped low world, then its gradients."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.typing import ArrayLike, DTypeLike
 from laws import assert_gradient, volume
 
 import wlplan
@@ -19,12 +22,12 @@ from wlplan.site.soil import GRAVEL
 from wlplan.terrain.automaton import relax
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import toe_contour
-from wlplan.types import LoadingPlan, Performance, Pile, Pose, action_from
+from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose, Rollout, World, action_from
 
 DENSITY = GRAVEL.density / 1000.0  # [tonne/m^3]
 
 
-def fake_world(pile, pose, action):
+def fake_world(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
     """Takes a part of every cell near x, the more the higher the threshold."""
     x = pile.origin[0] + pile.cell_size * jnp.arange(pile.height.shape[0])
     part = 0.3 * action.delta_bk * jnp.exp(-((x - pose.x) ** 2))
@@ -33,26 +36,26 @@ def fake_world(pile, pose, action):
     return after, Performance(mass=mass, time=5.0 + action.k_bm * mass, work=100.0 * pose.y + mass)
 
 
-def heap(seed=0):
+def heap(seed: int = 0) -> Pile:
     height = np.random.default_rng(seed).uniform(0.5, 1.5, (20, 12)).astype(np.float32)
     return Pile(jnp.asarray(height), 0.1, jnp.asarray([-1.0, 2.0]))
 
 
-def plan_of(rows, dtype=jnp.float32):
+def plan_of(rows: ArrayLike, dtype: DTypeLike = jnp.float32) -> LoadingPlan:
     """Plans from an array [..., N, 7]: x, y, heading, action."""
     rows = jnp.asarray(rows, dtype)
     pose = Pose(rows[..., 0], rows[..., 1], rows[..., 2])
     return LoadingPlan(pose=pose, action=action_from(rows[..., 3:]))
 
 
-def random_rows(seed, loads):
+def random_rows(seed: int, loads: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0.1, 0.7, (loads, 7))
 
 
 # --- Laws, with the fake world. -----------------------------------------------------------------
 
 
-def test_a_rollout_is_the_loop_over_its_loadings():
+def test_a_rollout_is_the_loop_over_its_loadings() -> None:
     plan, pile = plan_of(random_rows(0, 6)), heap()
     outcome = rollout(fake_world, pile, plan)
     for n in range(6):
@@ -67,13 +70,13 @@ def test_a_rollout_is_the_loop_over_its_loadings():
     assert outcome.performance.mass.shape == (6,)
 
 
-def test_no_loading_leaves_the_pile():
+def test_no_loading_leaves_the_pile() -> None:
     outcome = rollout(fake_world, heap(), plan_of(np.zeros((0, 7))))
     np.testing.assert_array_equal(outcome.pile.height, heap().height)
     assert outcome.performance.mass.shape == (0,)
 
 
-def test_the_parts_of_a_rollout_follow_on():
+def test_the_parts_of_a_rollout_follow_on() -> None:
     rows = random_rows(1, 5)
     whole = rollout(fake_world, heap(), plan_of(rows))
     first = rollout(fake_world, heap(), plan_of(rows[:2]))
@@ -86,7 +89,7 @@ def test_the_parts_of_a_rollout_follow_on():
     )
 
 
-def test_it_passes_jit_and_vmap_over_plans_and_piles():
+def test_it_passes_jit_and_vmap_over_plans_and_piles() -> None:
     plans = [plan_of(random_rows(s, 4)) for s in range(3)]
     piles = [heap(s) for s in range(3)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *plans)
@@ -101,35 +104,37 @@ def test_it_passes_jit_and_vmap_over_plans_and_piles():
         np.testing.assert_allclose(over_both.performance.mass[k], alone.performance.mass, rtol=1e-5)
 
 
-def test_it_passes_float64_and_gradients_in_plan_and_pile():
+def test_it_passes_float64_and_gradients_in_plan_and_pile() -> None:
     with jax.enable_x64(True):
         pile = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), jnp.float64), heap())
 
-        def cost(point):
+        def cost(point: tuple[LoadingPlan, jax.Array]) -> jax.Array:
             plan, height = point
             outcome = rollout(fake_world, pile.replace(height=height), plan)
             assert outcome.performance.mass.dtype == jnp.float64
-            total = jax.tree.map(jnp.sum, outcome.performance)
+            total: Performance = jax.tree.map(jnp.sum, outcome.performance)
             return total.mass + total.time + total.work / 100.0 + (outcome.pile.height**2).sum()
 
         assert_gradient(cost, (plan_of(random_rows(2, 3), jnp.float64), pile.height[:, :]))
 
 
-def test_closed_loop_decides_on_the_pile_as_it_is():
+def test_closed_loop_decides_on_the_pile_as_it_is() -> None:
     """The decision reads the pile; what it then saw is what the loop gives by hand."""
 
-    def decide(pile, threshold):
+    def decide(pile: Pile, threshold: jax.Array) -> tuple[Pose, Action]:
         zero = jnp.zeros(())
         pose = Pose(x=volume(pile), y=pile.height.max(), heading=zero)
         return pose, action_from(jnp.stack([zero, zero, threshold, zero]))
 
-    def world(pile, pose, action):
+    def world(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         after = pile.replace(height=pile.height * (1.0 - action.delta_bk))
         return after, Performance(mass=pose.x, time=pose.y, work=pose.heading)
 
     thresholds = jnp.asarray([0.5, 0.2, 0.1])
 
-    def record(_, pose, action, performance):
+    def record(
+        _: Pile, pose: Pose, action: Action, performance: Performance
+    ) -> tuple[LoadingPlan, Performance]:
         return LoadingPlan(pose, action), performance
 
     after, (plan, performance) = closed_loop(world, heap(), thresholds, decide, record)
@@ -147,12 +152,12 @@ def test_closed_loop_decides_on_the_pile_as_it_is():
 
 
 @pytest.fixture(scope="module")
-def low():
+def low() -> World:
     return wlplan.load_world("low")
 
 
 @pytest.fixture(scope="module")
-def cone():
+def cone() -> tuple[Pile, np.ndarray]:
     """A relaxed 30 degree cone and five loadings along its toe, two of them a second time."""
     pile = jax.jit(relax)(seed_pile("conical", slope=math.radians(30.0)))
     contour = toe_contour(pile)
@@ -175,26 +180,28 @@ def cone():
 
 
 @pytest.fixture(scope="module")
-def roll():
+def roll() -> Callable[..., Rollout]:
     """One compiled rollout for any world that is a pytree."""
     return jax.jit(lambda world, pile, plan: rollout(world, pile, plan))
 
 
-def in_float64(tree):
-    def widen(leaf):
+def in_float64(tree: Any) -> Any:
+    def widen(leaf: Any) -> Any:
         is_float = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
         return jnp.asarray(np.asarray(leaf), jnp.float64) if is_float else leaf
 
     return jax.tree.map(widen, tree)
 
 
-def lost_mass(before, after):
+def lost_mass(before: Pile, after: Pile) -> float:
     heights = (np.asarray(p.height, np.float64).sum() for p in (before, after))
     first, last = heights
-    return (first - last) * before.cell_size**2 * DENSITY
+    return float(first - last) * before.cell_size**2 * DENSITY
 
 
-def test_the_low_world_removes_what_it_loads(low, cone, roll):
+def test_the_low_world_removes_what_it_loads(
+    low: World, cone: tuple[Pile, np.ndarray], roll: Callable[..., Rollout]
+) -> None:
     pile, rows = cone
     outcome = roll(low, pile, plan_of(rows))
     mass = np.asarray(outcome.performance.mass, np.float64)
@@ -204,7 +211,9 @@ def test_the_low_world_removes_what_it_loads(low, cone, roll):
     assert np.min(outcome.performance.time) > 5.0
 
 
-def test_the_simulator_rolls_out_under_the_same_signature(cone, roll):
+def test_the_simulator_rolls_out_under_the_same_signature(
+    cone: tuple[Pile, np.ndarray], roll: Callable[..., Rollout]
+) -> None:
     pile, rows = cone
     outcome = roll(Simulator(), pile, plan_of(rows))
     mass = np.asarray(outcome.performance.mass, np.float64)
@@ -212,26 +221,28 @@ def test_the_simulator_rolls_out_under_the_same_signature(cone, roll):
     np.testing.assert_allclose(lost_mass(pile, outcome.pile), mass.sum(), rtol=1e-5)
 
 
-def cost_in(world, pile):
+def cost_in(world: World, pile: Pile) -> Callable[[LoadingPlan], jax.Array]:
     """The objective of a plan, transport included."""
     receiver = Receiver(*(jnp.asarray(v, pile.height.dtype) for v in (-18.0, -3.0, -0.5)))
     job = Job(world, pile, Site(receiver=receiver), objective_of("efficiency"))
     return lambda plan: play_candidate(job, plan, report=False).cost
 
 
-def test_gradient_of_five_loadings_against_finite_differences(low, cone):
+def test_gradient_of_five_loadings_against_finite_differences(
+    low: World, cone: tuple[Pile, np.ndarray]
+) -> None:
     with jax.enable_x64(True):
         world, pile = in_float64((low, cone[0]))
         cost = cost_in(world, pile)
         assert_gradient(cost, plan_of(cone[1], jnp.float64), skip=3)
 
 
-def test_the_gradient_check_can_fail():
+def test_the_gradient_check_can_fail() -> None:
     """A gradient that is a thousandth too long does not pass."""
     with jax.enable_x64(True):
         pile = in_float64(heap())
 
-        def cost(plan, error):
+        def cost(plan: LoadingPlan, error: float) -> jax.Array:
             total = rollout(fake_world, pile, plan).performance
             value = (total.mass + total.time + total.work / 100.0).sum()
             return value + error * (value - jax.lax.stop_gradient(value))
@@ -243,12 +254,12 @@ def test_the_gradient_check_can_fail():
 
 
 @pytest.fixture(scope="module")
-def gradient_of_one(low):
+def gradient_of_one(low: World) -> Callable[..., Any]:
     """Gradient of the cost of two loadings with respect to plan and heights."""
 
     @jax.jit
-    def run(height, origin, plan):
-        def cost(plan, height):
+    def run(height: jax.Array, origin: jax.Array, plan: LoadingPlan) -> Any:
+        def cost(plan: LoadingPlan, height: jax.Array) -> jax.Array:
             return cost_in(low, Pile(height, 0.1, origin))(plan)
 
         return jax.value_and_grad(cost, argnums=(0, 1))(plan, height)
@@ -257,7 +268,9 @@ def gradient_of_one(low):
 
 
 @pytest.mark.parametrize("case", ["on the pile", "off the pile", "off the grid", "flat", "hollow"])
-def test_gradients_are_finite_everywhere(case, cone, gradient_of_one):
+def test_gradients_are_finite_everywhere(
+    case: str, cone: tuple[Pile, np.ndarray], gradient_of_one: Callable[..., Any]
+) -> None:
     pile, rows = cone
     height, rows = pile.height, rows[[0, 0]]
     if case == "off the pile":
@@ -283,7 +296,7 @@ CELLS, CELL = 48, 0.2  # a small grid, from -4.8 m to 4.6 m
 SIDE = CELL * (np.arange(CELLS) - CELLS // 2)
 
 
-def small_piles():
+def small_piles() -> np.ndarray:
     """Heights [4, 48, 48]: a cone, level ground, a layer of 5 cm, and a ridge to the border."""
     x, y = np.meshgrid(SIDE, SIDE, indexing="ij")
     bumps = 0.1 * np.random.default_rng(0).normal(size=x.shape)
@@ -293,7 +306,7 @@ def small_piles():
     return np.stack(piles).astype(np.float32)
 
 
-def wild_rows(seed, plans, loads=2):
+def wild_rows(seed: int, plans: int, loads: int = 2) -> np.ndarray:
     """Plans [plans, loads, 7] of digs on the pile, off it, on lines of the grid and far outside.
 
     Half of the plans dig the same place again and again, which exhausts it. Actions reach the
@@ -326,7 +339,9 @@ ANY_PLAN = pytest.mark.parametrize(
 )
 
 
-def each_wild_plan(function, plans, floor):
+def each_wild_plan(
+    function: Callable[[Pile, LoadingPlan], Any], plans: int, floor: bool
+) -> tuple[Any, list[str]]:
     """`function(pile, plan)` of random plans, leaves [plans], and what those were, for messages.
 
     Args:
@@ -334,7 +349,8 @@ def each_wild_plan(function, plans, floor):
         plans: How many.
         floor: Whether there is a sloping floor under the piles, and a corner that was not seen.
     """
-    heights, fields = jnp.asarray(small_piles()), {}
+    heights = jnp.asarray(small_piles())
+    fields: dict[str, Any] = {}
     if floor:
         i, j = np.indices((CELLS, CELLS))
         fields = {"ground": jnp.asarray(0.02 * CELL * i, jnp.float32), "valid": i + j > 12}
@@ -343,7 +359,7 @@ def each_wild_plan(function, plans, floor):
     # Every pile with both kinds of plan.
     which = np.arange(plans) // 2 % len(heights)
 
-    def one(case):
+    def one(case: tuple[jax.Array, LoadingPlan]) -> Any:
         k, plan = case
         return function(Pile(heights[k], CELL, jnp.asarray(SIDE[[0, 0]]), **fields), plan)
 
@@ -354,11 +370,11 @@ def each_wild_plan(function, plans, floor):
 
 
 @ANY_PLAN
-def test_gradients_are_finite_for_any_plan(low, plans, floor):
-    def check(pile, plan):
+def test_gradients_are_finite_for_any_plan(low: World, plans: int, floor: bool) -> None:
+    def check(pile: Pile, plan: LoadingPlan) -> tuple[jax.Array, jax.Array]:
         """Whether the cost and its gradient in plan and heights are finite, and its largest."""
 
-        def cost(plan, height):
+        def cost(plan: LoadingPlan, height: jax.Array) -> jax.Array:
             return cost_in(low, pile.replace(height=height))(plan)
 
         leaves = jax.tree.leaves(jax.value_and_grad(cost, argnums=(0, 1))(plan, pile.height))
@@ -373,8 +389,8 @@ def test_gradients_are_finite_for_any_plan(low, plans, floor):
 
 
 @ANY_PLAN
-def test_the_ledger_closes_for_any_plan(low, plans, floor):
-    def check(pile, plan):
+def test_the_ledger_closes_for_any_plan(low: World, plans: int, floor: bool) -> None:
+    def check(pile: Pile, plan: LoadingPlan) -> tuple[jax.Array, jax.Array, jax.Array]:
         outcome = rollout(low, pile, plan)
         return pile.height, outcome.pile.height, outcome.performance.mass
 
@@ -385,13 +401,13 @@ def test_the_ledger_closes_for_any_plan(low, plans, floor):
 
 
 @pytest.mark.parametrize("reverse", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_vmap_over_plans_and_piles_equals_the_members(low, reverse):
+def test_vmap_over_plans_and_piles_equals_the_members(low: World, reverse: bool) -> None:
     """In the shipped world, where each member makes its own number of rounds."""
     with jax.enable_x64(True):
         world, piles = in_float64((low, jnp.asarray(small_piles()[[0, 3]])))
         plans = plan_of(wild_rows(2, 3), jnp.float64)
 
-        def play(height, plan):
+        def play(height: jax.Array, plan: LoadingPlan) -> Any:
             pile = Pile(height, CELL, jnp.asarray(SIDE[[0, 0]]))
             return jax.grad(cost_in(world, pile))(plan) if reverse else rollout(world, pile, plan)
 

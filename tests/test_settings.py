@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from typing import Any
 
 import click
 import pytest
@@ -15,7 +16,7 @@ from wlplan.training.settings import Setting, setting_of
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_setting_has_a_meaning_and_a_default_that_it_allows(kind):
+def test_every_setting_has_a_meaning_and_a_default_that_it_allows(kind: str) -> None:
     settings = KINDS[kind]()
     assert settings.kind == kind
     for field in dataclasses.fields(settings):
@@ -42,7 +43,9 @@ def test_every_setting_has_a_meaning_and_a_default_that_it_allows(kind):
         ({"encoder": "magic"}, "convolutional, principal"),
     ],
 )
-def test_what_a_setting_may_not_be_is_refused_in_one_line(change, word):
+def test_what_a_setting_may_not_be_is_refused_in_one_line(
+    change: dict[str, Any], word: str
+) -> None:
     with pytest.raises(InputError, match=word) as error:
         PsiHighSettings(**change)
     assert next(iter(change)) in str(error.value)
@@ -50,32 +53,38 @@ def test_what_a_setting_may_not_be_is_refused_in_one_line(change, word):
 
 
 @pytest.mark.parametrize(("value", "default"), [(1.5, 1), ("1", 1), (True, 1), (True, 1.0)])
-def test_a_setting_of_another_type_is_refused(value, default):
-    assert "has to be a" in Setting("Number.").complaint(value, default)
+def test_a_setting_of_another_type_is_refused(value: object, default: object) -> None:
+    assert "has to be a" in (Setting("Number.").complaint(value, default) or "")
 
 
-def test_every_setting_is_an_option_with_the_defaults_of_the_kinds():
+def test_every_setting_is_an_option_with_the_defaults_of_the_kinds() -> None:
     @click.command()
-    def command(**_):
+    def command(**_: object) -> None:
         """A command."""
 
     for option in training_options():
         command = option(command)
+    assert isinstance(command, click.Command)
     options = {option.name: option for option in command.params}
+    told = {
+        name: option.help or ""
+        for name, option in options.items()
+        if isinstance(option, click.Option)
+    }
     names = {field.name for kind in KINDS.values() for field in dataclasses.fields(kind)}
     assert set(options) == names - {"seed"}
     assert all(option.default is None for option in options.values())
-    assert "psi-low, psi-high 150; phi 100; phi-vae 40." in options["epochs"].help
-    assert options["members"].help.startswith("psi-low, psi-high: ")
-    assert options["hidden"].help.endswith("phi 512,512; phi-vae 1024,1024.")
+    assert "psi-low, psi-high 150; phi 100; phi-vae 40." in told["epochs"]
+    assert told["members"].startswith("psi-low, psi-high: ")
+    assert told["hidden"].endswith("phi 512,512; phi-vae 1024,1024.")
 
 
-def test_settings_of_two_kinds_are_never_the_same():
-    assert PsiLowSettings(dropout=0.1) != PsiHighSettings()
+def test_settings_of_two_kinds_are_never_the_same() -> None:
+    assert PsiLowSettings(dropout=0.1) != PsiHighSettings()  # type: ignore[comparison-overlap]
     assert PhiVaeSettings() == PhiVaeSettings(seed=0)
 
 
-def test_the_help_of_train_needs_no_jax():
+def test_the_help_of_train_needs_no_jax() -> None:
     code = (
         "import sys; from wlplan import cli; cli.main(['train', '--help']); "
         "sys.exit(str(sorted({'jax', 'flax', 'optax'} & set(sys.modules))))"

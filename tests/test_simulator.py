@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +15,19 @@ from scipy import ndimage, stats
 from experiments.dem_reference import REFERENCE, replay
 from wlplan.constants import ACTION_HIGH, GRAVITY
 from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig, terrain
-from wlplan.engines.simulator.cycle import advance, begin, outcome
-from wlplan.site.machine import WA320
-from wlplan.site.soil import GRAVEL
+from wlplan.engines.simulator.cycle import Cycle, advance, begin, outcome
+from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.soil import GRAVEL, Soil
 from wlplan.terrain.automaton import FLOW_FRACTION, relax, steepest_slope, sweep
 from wlplan.terrain.heightmap import local_axes
 from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
-from wlplan.terrain.toe import toe_contour
-from wlplan.types import Pile, Pose, action_from
+from wlplan.terrain.toe import ToeContour, toe_contour
+from wlplan.types import Action, Performance, Pile, Pose, action_from
+
+Played = tuple[Pile, Performance, Cycle]
+Loadings = tuple[
+    Callable[..., Played], tuple[Pile, Pose, Action], Played, tuple[slice, slice, slice]
+]
 
 ALONG, LEFT = local_axes(52, 1.0)
 GRID = 224  # cells a side that hold any seed pile
@@ -30,7 +37,7 @@ DENSITY = GRAVEL.density / 1000.0  # [tonne/m^3]
 MODERATE = np.array([0.35, 2.5, 0.35, 2.5])
 
 
-def random_actions(rng, n):
+def random_actions(rng: np.random.Generator, n: int) -> np.ndarray:
     return (rng.uniform(size=(n, 4)) * ACTION_HIGH).astype(np.float32)
 
 
@@ -38,7 +45,7 @@ def random_actions(rng, n):
 
 
 @pytest.fixture(scope="module")
-def seed_piles():
+def seed_piles() -> list[tuple[Pile, ToeContour]]:
     """Every seed pile relaxed, on a grid of one size, and its toe."""
     relaxed = jax.jit(relax)
     piles = []
@@ -57,7 +64,7 @@ def seed_piles():
 
 
 @pytest.fixture(scope="module")
-def loadings(seed_piles):
+def loadings(seed_piles: list[tuple[Pile, ToeContour]]) -> Loadings:
     """Random loadings on every seed pile, on uneven ground, and where there is nothing to dig.
 
     Returns the piles, poses and actions, what `Simulator.play` makes of them, and the slices of
@@ -68,7 +75,13 @@ def loadings(seed_piles):
     x, y = np.meshgrid(0.1 * np.arange(GRID), 0.1 * np.arange(GRID), indexing="ij")
     rough = 0.1 * np.sin(1.3 * x + 0.4) * np.cos(0.9 * y) + 0.03 * x
 
-    def add(pile, contour, count, floor, turn):
+    def add(
+        pile: Pile,
+        contour: ToeContour,
+        count: int,
+        floor: np.ndarray,
+        turn: Callable[[np.random.Generator], float],
+    ) -> None:
         for k in rng.choice(np.flatnonzero(contour.accessible), count, replace=False):
             floors.append(floor)
             heights.append(np.asarray(pile.height) + floor)
@@ -91,7 +104,7 @@ def loadings(seed_piles):
     origins.append(np.asarray(pile.origin))
     poses.append([0.0, 0.0, 0.5])
 
-    poses = jnp.asarray(np.array(poses), jnp.float32)
+    places = jnp.asarray(np.array(poses), jnp.float32)
     piles = Pile(
         jnp.asarray(np.array(heights), jnp.float32),
         0.1,
@@ -99,7 +112,7 @@ def loadings(seed_piles):
         ground=jnp.asarray(np.array(floors), jnp.float32),
     )
     actions = action_from(jnp.asarray(random_actions(rng, len(poses))))
-    inputs = piles, Pose(poses[:, 0], poses[:, 1], poses[:, 2]), actions
+    inputs = piles, Pose(places[:, 0], places[:, 1], places[:, 2]), actions
     play = jax.jit(jax.vmap(Simulator().play))
     seeds = POSES * len(seed_piles)
     uneven = seeds + 2 * len(seed_piles)
@@ -107,7 +120,7 @@ def loadings(seed_piles):
     return play, inputs, play(*inputs), groups
 
 
-def test_what_leaves_the_grid_is_the_load(loadings):
+def test_what_leaves_the_grid_is_the_load(loadings: Loadings) -> None:
     _, (piles, _, _), (after, performance, cycle), (seeds, uneven, nothing) = loadings
     before, left = (np.asarray(p.height, np.float64).sum((1, 2)) for p in (piles, after))
     lost = (before - left) * piles.cell_size**2 * DENSITY
@@ -118,7 +131,7 @@ def test_what_leaves_the_grid_is_the_load(loadings):
     np.testing.assert_allclose(np.asarray(cycle.mass), 1000.0 * mass, rtol=1e-6)
 
 
-def test_the_ledger_can_fail(loadings):
+def test_the_ledger_can_fail(loadings: Loadings) -> None:
     _, (piles, _, _), (after, performance, _), _ = loadings
     before, left = (np.asarray(p.height, np.float64).sum((1, 2)) for p in (piles, after))
     lost = (before - left) * piles.cell_size**2 * DENSITY
@@ -127,12 +140,12 @@ def test_the_ledger_can_fail(loadings):
         np.testing.assert_allclose(lost[:60], wrong[:60], rtol=1e-5)
 
 
-def test_nothing_is_dug_below_the_ground(loadings):
+def test_nothing_is_dug_below_the_ground(loadings: Loadings) -> None:
     _, (piles, _, _), (after, _, _), _ = loadings
     assert (np.asarray(after.height) - np.asarray(piles.ground)).min() >= -1e-5
 
 
-def test_far_from_the_bucket_a_little_soil_slides_at_most(loadings):
+def test_far_from_the_bucket_a_little_soil_slides_at_most(loadings: Loadings) -> None:
     """Beyond the window of the automaton only an avalanche that leaves it can move soil."""
     _, (piles, pose, _), (after, _, _), (seeds, _, _) = loadings
     axis = 0.1 * np.arange(GRID)
@@ -149,13 +162,13 @@ def test_far_from_the_bucket_a_little_soil_slides_at_most(loadings):
     assert (moved * far).sum() < 0.02 * moved.sum()
 
 
-def test_the_pile_after_is_within_a_degree_of_the_angle_of_repose(loadings):
+def test_the_pile_after_is_within_a_degree_of_the_angle_of_repose(loadings: Loadings) -> None:
     _, _, (after, _, _), (seeds, _, _) = loadings
     steepest = jax.vmap(lambda h: steepest_slope(Pile(h, 0.1)))(after.height[seeds])
     assert np.degrees(np.max(steepest)) <= 33.0 + 1e-3
 
 
-def test_where_there_is_nothing_the_bucket_stays_empty(loadings):
+def test_where_there_is_nothing_the_bucket_stays_empty(loadings: Loadings) -> None:
     _, (piles, _, _), (after, performance, cycle), (_, _, nothing) = loadings
     np.testing.assert_allclose(np.asarray(performance.mass)[nothing], 0.0, atol=1e-6)
     # The seed piles are relaxed to within a degree, so a window may still slide by a little.
@@ -164,13 +177,13 @@ def test_where_there_is_nothing_the_bucket_stays_empty(loadings):
     assert set(reasons) <= {STOP_REASONS.index(r) for r in ("tilt_end", "penetration", "breakout")}
 
 
-def test_everything_is_finite(loadings):
+def test_everything_is_finite(loadings: Loadings) -> None:
     _, _, outcome, _ = loadings
     for leaf in jax.tree.leaves(outcome):
         assert np.isfinite(leaf).all()
 
 
-def test_outcomes_lie_in_the_expected_ranges(loadings):
+def test_outcomes_lie_in_the_expected_ranges(loadings: Loadings) -> None:
     _, _, (_, performance, cycle), (seeds, _, _) = loadings
     mass, time, work = (
         np.asarray(v)[seeds] for v in (performance.mass, performance.time, performance.work)
@@ -186,7 +199,7 @@ def test_outcomes_lie_in_the_expected_ranges(loadings):
     assert np.bincount(np.asarray(cycle.stop_reason)[seeds], minlength=4)[:3].min() > 0
 
 
-def test_the_parts_of_the_work_are_its_sum_and_not_negative(loadings):
+def test_the_parts_of_the_work_are_its_sum_and_not_negative(loadings: Loadings) -> None:
     _, _, (_, performance, cycle), _ = loadings
     parts = [cycle.work_drive, cycle.work_boom, cycle.work_bucket, cycle.work_slip]
     for part in parts:
@@ -194,7 +207,7 @@ def test_the_parts_of_the_work_are_its_sum_and_not_negative(loadings):
     np.testing.assert_allclose(sum(parts) / 1000.0, performance.work, rtol=1e-5)
 
 
-def test_a_batch_equals_its_members(loadings):
+def test_a_batch_equals_its_members(loadings: Loadings) -> None:
     """A batch of copies ends when its one member does, whatever the others of the batch did."""
     play, inputs, outcome, (_, uneven, _) = loadings
     slowest = int(np.argmax(np.asarray(outcome[1].time)))
@@ -208,26 +221,29 @@ def test_a_batch_equals_its_members(loadings):
 # --- Single digs on made-up surfaces. ----------------------------------------------------------
 
 
-def ramp(slope, incidence=0.0, top=4.0):
+def ramp(slope: float, incidence: float = 0.0, top: float = 4.0) -> np.ndarray:
     """A plane that rises from the dig location, cut off at a height [m]; angles in degrees."""
     a = math.radians(incidence)
     distance = math.cos(a) * ALONG[:, None] + math.sin(a) * LEFT[None, :]
     return np.clip(math.tan(math.radians(slope)) * distance, 0.0, top).astype(np.float32)
 
 
-def bumpy(seed, slope=26.0):
+def bumpy(seed: int, slope: float = 26.0) -> np.ndarray:
     """A ramp with smooth random bumps, no two sides alike."""
     noise = np.random.default_rng(seed).normal(size=(52, 52))
     noise = ndimage.gaussian_filter(noise, 6.0)
-    return np.maximum(ramp(slope) * (1.0 + 0.5 * noise / noise.std() * 0.3), 0.0).astype(np.float32)
+    bumps: np.ndarray = np.maximum(ramp(slope) * (1.0 + 0.5 * noise / noise.std() * 0.3), 0.0)
+    return bumps.astype(np.float32)
 
 
-def batched(step=0.02, machine=WA320, batch=BATCH):
+def batched(
+    step: float = 0.02, machine: WheelLoader = WA320, batch: int = BATCH
+) -> Callable[[Any, Any], Cycle]:
     """`dig` over lists of surfaces and actions, compiled for batches of one size."""
 
     @jax.jit
     @jax.vmap
-    def run(height, action):
+    def run(height: jax.Array, action: jax.Array) -> Cycle:
         return dig(
             height,
             jnp.zeros_like(height),
@@ -236,24 +252,25 @@ def batched(step=0.02, machine=WA320, batch=BATCH):
             machine=machine,
         )
 
-    def call(heights, actions):
+    def call(heights: Any, actions: Any) -> Cycle:
         heights, actions = np.array(heights, np.float32), np.array(actions, np.float32)
         n = len(actions)
         assert n <= batch
         fill = np.minimum(np.arange(batch), n - 1)
-        return jax.tree.map(
+        cycle: Cycle = jax.tree.map(
             lambda v: np.asarray(v)[:n], run(jnp.asarray(heights[fill]), jnp.asarray(actions[fill]))
         )
+        return cycle
 
     return call
 
 
 @pytest.fixture(scope="module")
-def digs():
+def digs() -> Callable[[Any, Any], Cycle]:
     return batched()
 
 
-def total_work(cycle):
+def total_work(cycle: Cycle) -> jax.Array:
     return cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
 
 
@@ -267,18 +284,18 @@ ENDS = {
 
 
 @pytest.fixture(scope="module")
-def ends(digs):
+def ends(digs: Callable[[Any, Any], Cycle]) -> dict[str, Cycle]:
     cycles = digs([h for h, _ in ENDS.values()], [a for _, a in ENDS.values()])
     return {r: jax.tree.map(lambda v, k=k: v[k], cycles) for k, r in enumerate(ENDS)}
 
 
 @pytest.mark.parametrize("reason", STOP_REASONS)
-def test_every_event_ends_some_dig(ends, reason):
+def test_every_event_ends_some_dig(ends: dict[str, Cycle], reason: str) -> None:
     assert STOP_REASONS[int(ends[reason].stop_reason)] == reason
     assert 0.0 < ends[reason].fill_time <= 15.0 + 1e-4
 
 
-def test_events_are_located_where_they_are_defined(ends):
+def test_events_are_located_where_they_are_defined(ends: dict[str, Cycle]) -> None:
     assert ends["penetration"].tip_x == pytest.approx(3.2, abs=1e-3)
     assert ends["penetration"].tip_z == pytest.approx(0.0, abs=1e-3)
     assert ends["timeout"].fill_time == pytest.approx(15.0, abs=1e-3)
@@ -293,11 +310,11 @@ def test_events_are_located_where_they_are_defined(ends):
     assert breakout.tip_z - there == pytest.approx(0.05, abs=2e-3)
 
 
-def pin_height():
+def pin_height() -> float:
     return WA320.pivot_height + WA320.boom_length * math.sin(WA320.boom_low)
 
 
-def test_no_dig_goes_past_an_event(digs):
+def test_no_dig_goes_past_an_event(digs: Callable[[Any, Any], Cycle]) -> None:
     rng = np.random.default_rng(1)
     cycle = digs([bumpy(k) for k in range(BATCH)], random_actions(rng, BATCH))
     assert (cycle.tip_x <= 3.2 + 1e-3).all()
@@ -307,7 +324,7 @@ def test_no_dig_goes_past_an_event(digs):
     np.testing.assert_allclose(cycle.tip_x[reached], 3.2, atol=1e-3)
 
 
-def test_left_and_right_are_alike(digs):
+def test_left_and_right_are_alike(digs: Callable[[Any, Any], Cycle]) -> None:
     rng = np.random.default_rng(2)
     surfaces, actions = [bumpy(k) for k in range(20)], random_actions(rng, 20)
     assert max(np.abs(h - h[:, ::-1]).max() for h in surfaces) > 0.1
@@ -321,7 +338,7 @@ def test_left_and_right_are_alike(digs):
     assert difference.max() < 2e-2
 
 
-def test_the_local_ledger_closes(digs):
+def test_the_local_ledger_closes(digs: Callable[[Any, Any], Cycle]) -> None:
     rng = np.random.default_rng(3)
     surfaces = np.array([bumpy(k) for k in range(20)])
     cycle = digs(surfaces, random_actions(rng, 20))
@@ -329,13 +346,13 @@ def test_the_local_ledger_closes(digs):
     np.testing.assert_allclose(lost * 0.01 * GRAVEL.density, cycle.mass, rtol=2e-5)
 
 
-def test_the_local_surface_stays_above_the_ground(digs):
+def test_the_local_surface_stays_above_the_ground(digs: Callable[[Any, Any], Cycle]) -> None:
     rng = np.random.default_rng(3)
     cycle = digs([bumpy(k) for k in range(20)], random_actions(rng, 20))
     assert cycle.height.min() >= -1e-5
 
 
-def test_a_smaller_time_step_changes_little(digs):
+def test_a_smaller_time_step_changes_little(digs: Callable[[Any, Any], Cycle]) -> None:
     rng = np.random.default_rng(4)
     surfaces, actions = [bumpy(k) for k in range(24)], random_actions(rng, 24)
     coarse = digs(surfaces, actions)
@@ -351,7 +368,7 @@ def test_a_smaller_time_step_changes_little(digs):
         assert np.mean(change > 0.05) <= 0.15
 
 
-def test_a_steeper_slope_loads_more_a_second(digs):
+def test_a_steeper_slope_loads_more_a_second(digs: Callable[[Any, Any], Cycle]) -> None:
     slopes = (15.0, 20.0, 25.0, 30.0)
     actions = [MODERATE, [0.2, 2.0, 0.3, 2.0], [0.5, 3.0, 0.4, 3.0], [0.3, 1.5, 0.2, 1.0]]
     cycle = digs([ramp(s) for s in slopes for _ in actions], actions * len(slopes))
@@ -359,7 +376,7 @@ def test_a_steeper_slope_loads_more_a_second(digs):
     assert np.all(np.diff(productivity) > 0.0), productivity
 
 
-def test_head_on_loads_more_a_second_than_aslant(digs):
+def test_head_on_loads_more_a_second_than_aslant(digs: Callable[[Any, Any], Cycle]) -> None:
     angles = (0.0, 20.0, 40.0)
     actions = [MODERATE, [0.2, 2.0, 0.3, 2.0], [0.5, 3.0, 0.4, 3.0], [0.3, 1.5, 0.2, 1.0]]
     cycle = digs([ramp(28.0, a) for a in angles for _ in actions], actions * len(angles))
@@ -367,14 +384,14 @@ def test_head_on_loads_more_a_second_than_aslant(digs):
     assert productivity[0] > productivity[2], productivity
 
 
-def test_tilting_later_fills_more(digs):
+def test_tilting_later_fills_more(digs: Callable[[Any, Any], Cycle]) -> None:
     thresholds = np.linspace(0.15, 0.5, 8)
     cycle = digs([ramp(28.0)] * 8, [[0.7, 0.0, t, 3.0] for t in thresholds])
     assert cycle.mass[-1] > 1.15 * cycle.mass[0], cycle.mass
     assert stats.spearmanr(thresholds, cycle.mass).statistic > 0.9
 
 
-def test_a_drive_into_nothing_has_a_closed_form(digs):
+def test_a_drive_into_nothing_has_a_closed_form(digs: Callable[[Any, Any], Cycle]) -> None:
     """Approach and penetration at a steady speed, tilt, brake, and the way back."""
     cycle = digs([np.zeros((52, 52))], [[0.7, 0.0, 0.7, 0.0]])
     speed, weight = WA320.travel_speed, WA320.mass * GRAVITY
@@ -394,7 +411,7 @@ def test_a_drive_into_nothing_has_a_closed_form(digs):
     assert cycle.work_slip == 0.0
 
 
-def test_soil_slides_by_the_rule_of_the_automaton():
+def test_soil_slides_by_the_rule_of_the_automaton() -> None:
     surface = np.stack([bumpy(k, slope=40.0) for k in range(3)], axis=-1)
     rim = terrain.rimmed(jnp.asarray(surface))
     flow = terrain._outflow(rim, jnp.ones_like(rim), 0.06, 10.0)
@@ -408,21 +425,29 @@ def test_soil_slides_by_the_rule_of_the_automaton():
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 12, 13, 28, 52])
-def test_a_sum_by_halves_is_the_sum(count):
+def test_a_sum_by_halves_is_the_sum(count: int) -> None:
     values = np.random.default_rng(count).normal(size=(count, 3))
     np.testing.assert_allclose(terrain.total(jnp.asarray(values)), values.sum(0), atol=1e-5)
 
 
-def met_by(height, x=2.0, z=0.5, tilt=0.0, soil=GRAVEL, fill=0.0, ground=0.0):
+def met_by(
+    height: np.ndarray,
+    x: float = 2.0,
+    z: float = 0.5,
+    tilt: float = 0.0,
+    soil: Soil = GRAVEL,
+    fill: float = 0.0,
+    ground: float = 0.0,
+) -> terrain.Reaction:
     """`terrain.reaction` against one surface, in double precision."""
-    height = terrain.rimmed(jnp.asarray(height, jnp.float64)[..., None])
+    rim = terrain.rimmed(jnp.asarray(height, jnp.float64)[..., None])
     fills = jnp.full((terrain.Lanes(WA320).count, 1), fill)
     bucket = terrain.Bucket(*(jnp.asarray([v]) for v in (x, z, tilt)))
-    ground = jnp.full_like(height, ground)
-    return terrain.reaction(WA320, soil, height, ground, fills, bucket, jnp.asarray(True))
+    floor = jnp.full_like(rim, ground)
+    return terrain.reaction(WA320, soil, rim, floor, fills, bucket, jnp.asarray(True))
 
 
-def test_a_level_floor_rests_on_the_soil_it_has_cut():
+def test_a_level_floor_rests_on_the_soil_it_has_cut() -> None:
     """The plate's thickness times the stiffness and the floor's area; nothing on hard ground."""
     with jax.enable_x64(True):
         cut = 0.5 * np.ones((52, 52))
@@ -439,7 +464,7 @@ def test_a_level_floor_rests_on_the_soil_it_has_cut():
         assert float(hard.vertical[0]) == pytest.approx(float(unborne.vertical[0]), abs=1e-6)
 
 
-def test_soil_behind_the_map_bears_nothing():
+def test_soil_behind_the_map_bears_nothing() -> None:
     """The bucket's back reaches over the near edge of the map: cells there count once, not more."""
     with jax.enable_x64(True):
         spill = np.where(ALONG < -0.95, 0.1, 0.0)[:, None] * np.ones(52)
@@ -450,7 +475,7 @@ def test_soil_behind_the_map_bears_nothing():
         assert 0.5 * one_cell < lift < 1.1 * one_cell
 
 
-def test_a_tilted_floor_sinks_in_and_a_steep_path_frees_it():
+def test_a_tilted_floor_sinks_in_and_a_steep_path_frees_it() -> None:
     with jax.enable_x64(True):
         level = 0.5 * np.ones((52, 52))
         along_path = np.maximum(0.5 - (2.0 - ALONG) * math.tan(0.5), 0.0)[:, None] * np.ones(52)
@@ -460,7 +485,7 @@ def test_a_tilted_floor_sinks_in_and_a_steep_path_frees_it():
         assert float(sunk.horizontal[0]) > float(free.horizontal[0]) >= 0.0
 
 
-def test_the_content_is_weighed_pushed_and_carried():
+def test_the_content_is_weighed_pushed_and_carried() -> None:
     """Level, out of the soil: friction and push against travel, weight and carried soil down."""
     with jax.enable_x64(True):
         flat = np.zeros((52, 52))
@@ -472,7 +497,7 @@ def test_the_content_is_weighed_pushed_and_carried():
         assert float(got.vertical[0]) == pytest.approx((1 + GRAVEL.content_carry) * load, rel=1e-6)
 
 
-def test_soil_pushed_out_of_a_lane_is_laid_down_whole_and_alike_on_both_sides():
+def test_soil_pushed_out_of_a_lane_is_laid_down_whole_and_alike_on_both_sides() -> None:
     lanes = terrain.Lanes(WA320)
     aside = terrain._aside(lanes)
     assert aside.shape == (54, lanes.count)
@@ -484,7 +509,7 @@ def test_soil_pushed_out_of_a_lane_is_laid_down_whole_and_alike_on_both_sides():
 
 
 @pytest.mark.parametrize("width", [WA320.bucket_width, 5.2])
-def test_what_stands_over_the_side_plates_falls_beside_the_bucket(width):
+def test_what_stands_over_the_side_plates_falls_beside_the_bucket(width: float) -> None:
     machine = dataclasses.replace(WA320, bucket_width=width)
     lanes = terrain.Lanes(machine)
     height = terrain.rimmed(jnp.zeros((52, 52, 1)))
@@ -502,13 +527,13 @@ def test_what_stands_over_the_side_plates_falls_beside_the_bucket(width):
     np.testing.assert_array_equal(columns, [max(lanes.first - 1, 0), min(lanes.end, 51)])
 
 
-def test_cycles_advanced_in_parts_end_alike(digs):
+def test_cycles_advanced_in_parts_end_alike(digs: Callable[[Any, Any], Cycle]) -> None:
     """A few steps at a time, in one go, and next to others that took longer: the same bytes."""
     rng = np.random.default_rng(5)
     height = jnp.asarray(np.stack([bumpy(k) for k in range(8)], axis=-1))
     action = action_from(jnp.asarray(random_actions(rng, 8)))
     state = begin(height, jnp.zeros_like(height), action, WA320)
-    options = {"machine": WA320, "soil": GRAVEL, "settings": Settings()}
+    options: dict[str, Any] = {"machine": WA320, "soil": GRAVEL, "settings": Settings()}
     part, whole = (jax.jit(partial(advance, **options, steps=n)) for n in (7, 2000))
     once = whole(state)
     while not state.has_ended.all():
@@ -524,25 +549,29 @@ def test_cycles_advanced_in_parts_end_alike(digs):
 
 
 @pytest.fixture(scope="module")
-def against_dem():
+def against_dem() -> tuple[dict[str, np.ndarray], Cycle]:
     return replay()
 
 
-def test_the_stored_reference_says_where_it_comes_from():
+def test_the_stored_reference_says_where_it_comes_from() -> None:
     with np.load(REFERENCE) as file:
         reference = dict(file)
     assert "LAMMPS" in str(reference["provenance"])
     assert reference["h0_cg"].shape == (len(reference["mass_t"]), 52, 52)
 
 
-def test_masses_rank_like_the_discrete_elements(against_dem):
+def test_masses_rank_like_the_discrete_elements(
+    against_dem: tuple[dict[str, np.ndarray], Cycle],
+) -> None:
     reference, cycle = against_dem
     simulated = cycle.mass / 1000.0
     assert stats.spearmanr(simulated, reference["mass_t"]).statistic >= 0.75
     assert abs(np.mean(simulated / reference["mass_t"]) - 1.0) < 0.15
 
 
-def test_times_and_works_are_not_far_from_the_discrete_elements(against_dem):
+def test_times_and_works_are_not_far_from_the_discrete_elements(
+    against_dem: tuple[dict[str, np.ndarray], Cycle],
+) -> None:
     reference, cycle = against_dem
     work = (cycle.work_drive + cycle.work_boom + cycle.work_bucket) / 1000.0
     assert abs(np.mean(cycle.time / reference["time_s"]) - 1.0) < 0.15
@@ -565,12 +594,12 @@ OF_POINT, OF_OUTPUT = np.array([0, 0, 0, 1, 2]), np.array([0, 1, 2, 0, 0])
 
 
 @pytest.fixture(scope="module")
-def derivatives():
+def derivatives() -> tuple[np.ndarray, ...]:
     """Outcomes of both settings, gradients [5, 7] and central differences [4, 7]."""
     with jax.enable_x64(True):
         cone = seed_pile("conical", slope=math.radians(30.0), seed=3)
 
-        def outcome(world, vector):
+        def outcome(world: Simulator, vector: jax.Array) -> jax.Array:
             _, performance = world(cone, Pose(*vector[:3]), action_from(vector[3:]))
             return jnp.stack([performance.mass, performance.time, performance.work])
 
@@ -578,7 +607,7 @@ def derivatives():
 
         @jax.jit
         @jax.vmap
-        def gradient(vector, weight):
+        def gradient(vector: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
             return jax.value_and_grad(lambda v: outcome(fixed, v) @ weight)(vector)
 
         points = np.concatenate([SMOOTH, NOWHERE[None]])
@@ -601,13 +630,15 @@ def derivatives():
 
 
 @pytest.mark.slow
-def test_the_differentiable_setting_gives_the_same_outcome(derivatives):
+def test_the_differentiable_setting_gives_the_same_outcome(
+    derivatives: tuple[np.ndarray, ...],
+) -> None:
     fixed, default, _, _ = derivatives
     np.testing.assert_allclose(fixed, default, rtol=1e-6)
 
 
 @pytest.mark.slow
-def test_gradients_against_finite_differences(derivatives):
+def test_gradients_against_finite_differences(derivatives: tuple[np.ndarray, ...]) -> None:
     _, _, gradient, central = derivatives
     size = np.linalg.norm(central, axis=-1)
     assert (size > 0.0).all()
@@ -616,6 +647,8 @@ def test_gradients_against_finite_differences(derivatives):
 
 
 @pytest.mark.slow
-def test_gradients_are_finite_where_there_is_nothing_to_dig(derivatives):
+def test_gradients_are_finite_where_there_is_nothing_to_dig(
+    derivatives: tuple[np.ndarray, ...],
+) -> None:
     _, _, gradient, _ = derivatives
     assert np.isfinite(gradient).all()

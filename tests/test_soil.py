@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +15,25 @@ from wlplan.constants import GRAVITY
 from wlplan.engines.simulator.soil import least_resistance, wedge_of
 from wlplan.site.soil import GRAVEL, Soil
 
+# Depths, rakes, slopes and external frictions.
+Cuts = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
 # Design, section 5: rake 60, external friction 20, internal friction 35 degrees, flat ground.
 ORACLE = Soil(density=1800.0, friction=math.radians(35.0), steel_friction=math.radians(20.0))
 STICKY = dataclasses.replace(ORACLE, cohesion=10e3, adhesion=5e3)
 RAKE, DEPTH = math.radians(60.0), 0.5
 
 
-def documented(depth, rake, slope, *, soil, external_friction, surcharge=0.0, trials=4001):
+def documented(
+    depth: float,
+    rake: float,
+    slope: float,
+    *,
+    soil: Soil,
+    external_friction: float,
+    surcharge: float = 0.0,
+    trials: int = 4001,
+) -> tuple[float, float, float]:
     """The equation of the module's docstring at many failure angles, in numpy.
 
     Returns the least force [N/m], the failure angle [rad] and N_gamma there.
@@ -38,7 +52,7 @@ def documented(depth, rake, slope, *, soil, external_friction, surcharge=0.0, tr
 
 
 @pytest.fixture(scope="module")
-def random_cuts():
+def random_cuts() -> Cuts:
     """Depth [m], rake, slope and external friction [rad] as a bucket meets them."""
     rng = np.random.default_rng(0)
     slope = np.radians(rng.uniform(-10.0, 31.0, 400))
@@ -48,7 +62,15 @@ def random_cuts():
     return rng.uniform(0.02, 1.5, 400), rake, slope, friction
 
 
-def earthmoving_force(depth, rake, slope, *, soil, external_friction=None, surcharge=0.0):
+def earthmoving_force(
+    depth: jax.Array,
+    rake: jax.Array,
+    slope: jax.Array,
+    *,
+    soil: Soil,
+    external_friction: Any = None,
+    surcharge: float = 0.0,
+) -> jax.Array:
     """Force on a blade a metre of width [N/m], as the simulator computes it."""
     friction = soil.steel_friction if external_friction is None else external_friction
     wedge = wedge_of(depth, rake, slope, friction, soil=soil, surcharge=surcharge)
@@ -58,18 +80,18 @@ def earthmoving_force(depth, rake, slope, *, soil, external_friction=None, surch
 run = jax.jit(earthmoving_force, static_argnames=("soil", "surcharge"))
 
 
-def forces(cuts, soil, surcharge=0.0):
+def forces(cuts: Sequence[np.ndarray], soil: Soil, surcharge: float = 0.0) -> np.ndarray:
     depth, rake, slope, friction = (jnp.asarray(v, jnp.float32) for v in cuts)
     force = run(depth, rake, slope, external_friction=friction, soil=soil, surcharge=surcharge)
     return np.asarray(force)
 
 
-def at(depth, rake, slope, **options):
+def at(depth: float, rake: float, slope: float, **options: Any) -> jax.Array:
     return earthmoving_force(jnp.asarray(depth), jnp.asarray(rake), jnp.asarray(slope), **options)
 
 
 @pytest.mark.parametrize(("soil", "kilonewton"), [(ORACLE, 8.0), (STICKY, 25.1)])
-def test_the_oracle_on_flat_ground(soil, kilonewton):
+def test_the_oracle_on_flat_ground(soil: Soil, kilonewton: float) -> None:
     assert at(DEPTH, RAKE, 0.0, soil=soil) == pytest.approx(kilonewton * 1e3, rel=6e-3)
     force, _, _ = documented(
         DEPTH, RAKE, 0.0, soil=soil, external_friction=soil.steel_friction, trials=40001
@@ -77,7 +99,7 @@ def test_the_oracle_on_flat_ground(soil, kilonewton):
     assert at(DEPTH, RAKE, 0.0, soil=soil) == pytest.approx(force, rel=1e-4)
 
 
-def test_the_failure_angle_of_the_oracle():
+def test_the_failure_angle_of_the_oracle() -> None:
     _, angle, n_gamma = documented(
         DEPTH, RAKE, 0.0, soil=ORACLE, external_friction=ORACLE.steel_friction, trials=40001
     )
@@ -97,7 +119,9 @@ def test_the_failure_angle_of_the_oracle():
     ],
 )
 @pytest.mark.parametrize("surcharge", [0.0, 5e3])
-def test_it_is_the_minimum_over_the_failure_angle(soil, surcharge, random_cuts):
+def test_it_is_the_minimum_over_the_failure_angle(
+    soil: Soil, surcharge: float, random_cuts: Cuts
+) -> None:
     reference = [
         documented(d, r, s, soil=soil, external_friction=f, surcharge=surcharge)[0]
         for d, r, s, f in zip(*random_cuts, strict=True)
@@ -105,11 +129,11 @@ def test_it_is_the_minimum_over_the_failure_angle(soil, surcharge, random_cuts):
     np.testing.assert_allclose(forces(random_cuts, soil, surcharge), reference, rtol=5e-3)
 
 
-def test_without_cohesion_it_is_coulombs_passive_pressure():
+def test_without_cohesion_it_is_coulombs_passive_pressure() -> None:
     """Coulomb's closed form, the surface turned level: same wedge, same plane of failure."""
     phi = ORACLE.friction
-    for rake, slope, delta in ((60, 0, 20), (80, 0, 20), (60, 0, 10), (60, 20, 20), (55, -8, 25)):
-        rake, slope, delta = (math.radians(v) for v in (rake, slope, delta))
+    for degrees in ((60, 0, 20), (80, 0, 20), (60, 0, 10), (60, 20, 20), (55, -8, 25)):
+        rake, slope, delta = (math.radians(v) for v in degrees)
         # The back of the wall stands at this angle over the horizontal, this high.
         wall = rake - slope
         rise = DEPTH / math.sin(rake) * math.sin(wall)
@@ -126,7 +150,7 @@ def test_without_cohesion_it_is_coulombs_passive_pressure():
         assert force == pytest.approx(coulomb, rel=1e-3)
 
 
-def test_deeper_is_harder_and_the_surface_is_free(random_cuts):
+def test_deeper_is_harder_and_the_surface_is_free(random_cuts: Cuts) -> None:
     depth, *rest = random_cuts
     for soil in (ORACLE, STICKY):
         shallow, deep = forces((depth, *rest), soil), forces((1.1 * depth, *rest), soil)
@@ -135,7 +159,7 @@ def test_deeper_is_harder_and_the_surface_is_free(random_cuts):
         assert (shallow > 0.0).all()
 
 
-def test_it_scales_as_the_equation_does(random_cuts):
+def test_it_scales_as_the_equation_does(random_cuts: Cuts) -> None:
     depth, *rest = random_cuts
     base = forces(random_cuts, GRAVEL)
     heavy = forces(random_cuts, dataclasses.replace(GRAVEL, density=2 * GRAVEL.density))
@@ -148,12 +172,12 @@ def test_it_scales_as_the_equation_does(random_cuts):
     np.testing.assert_allclose(loaded, 2 * plain, rtol=1e-5)
 
 
-def test_cohesion_adds_resistance(random_cuts):
+def test_cohesion_adds_resistance(random_cuts: Cuts) -> None:
     sticky = dataclasses.replace(GRAVEL, cohesion=1e3)
     assert (forces(random_cuts, sticky) > forces(random_cuts, GRAVEL)).all()
 
 
-def test_lanes_are_independent(random_cuts):
+def test_lanes_are_independent(random_cuts: Cuts) -> None:
     together = forces(random_cuts, GRAVEL)
     for k in (0, 17):
         depth, rake, slope, friction = (v[k] for v in random_cuts)
@@ -161,29 +185,32 @@ def test_lanes_are_independent(random_cuts):
         assert alone == pytest.approx(together[k], rel=1e-5)
 
 
-def gradient_case(cuts, pick):
+def gradient_case(
+    cuts: Cuts, pick: list[int]
+) -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
     """Force as a function of the picked inputs of a few cuts, and those inputs."""
     point = jnp.asarray(np.stack([v[:4] for v in cuts]))
 
-    def force(picked):
+    def force(picked: jax.Array) -> jax.Array:
         full = point.at[jnp.asarray(pick)].set(picked)
-        return run(*full[:3], soil=GRAVEL, external_friction=full[3]).sum() / 1e3
+        total: jax.Array = run(*full[:3], soil=GRAVEL, external_friction=full[3]).sum() / 1e3
+        return total
 
     return force, point[jnp.asarray(pick)]
 
 
-def test_gradient_in_depth_against_finite_differences(random_cuts):
+def test_gradient_in_depth_against_finite_differences(random_cuts: Cuts) -> None:
     with jax.enable_x64(True):
         assert_gradient(*gradient_case(random_cuts, [0]), relative=1e-6)
 
 
-def test_gradient_in_angles_against_finite_differences(random_cuts):
+def test_gradient_in_angles_against_finite_differences(random_cuts: Cuts) -> None:
     """The failure angle counts as a constant, so this is as good as the angle is."""
     with jax.enable_x64(True):
         assert_gradient(*gradient_case(random_cuts, [1, 2, 3]), relative=3e-3)
 
 
-def test_gradients_are_finite_at_the_surface_and_beyond_locking():
+def test_gradients_are_finite_at_the_surface_and_beyond_locking() -> None:
     for depth, rake, slope in ((0.0, 1.0, 0.0), (0.5, math.radians(80), math.radians(35))):
         value, gradient = jax.value_and_grad(
             lambda p: earthmoving_force(*p, soil=GRAVEL, external_friction=GRAVEL.friction)

@@ -3,6 +3,9 @@
 import dataclasses
 import json
 import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +18,11 @@ from wlplan.constants import ACTION_HIGH
 from wlplan.dataset import VARIABLES, Dataset, split
 from wlplan.errors import InputError
 from wlplan.models import storage
-from wlplan.models.psi_low import PsiLow
+from wlplan.models.psi_low import LowPerformanceModel, PsiLow
 from wlplan.models.storage import load_model, read_description, save_model
 from wlplan.training import (
     LOSSES,
+    EvaluationReport,
     PsiLowSettings,
     evaluate_performance,
     fitting,
@@ -31,7 +35,7 @@ LIGHT = PsiLowSettings(epochs=40, batch=64, hidden=(32, 32), dropout=0.0, learni
 ONE_EPOCH = dataclasses.replace(LIGHT, epochs=1)
 
 
-def synthetic(rollouts=40, loads=15, seed=0):
+def synthetic(rollouts: int = 40, loads: int = 15, seed: int = 0) -> Dataset:
     """Cycles whose outcome is a smooth closed form of characteristics and action."""
     n = rollouts * loads
     random = np.random.default_rng(seed)
@@ -55,23 +59,26 @@ def synthetic(rollouts=40, loads=15, seed=0):
 
 
 @pytest.fixture(scope="module")
-def data():
+def data() -> Dataset:
     return synthetic()
 
 
 @pytest.fixture(scope="module")
-def saved(data, tmp_path_factory):
+def saved(
+    data: Dataset, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, LowPerformanceModel, EvaluationReport]:
     directory = tmp_path_factory.mktemp("training") / "psi_low"
     model, report = train(LIGHT, data, out=directory)
+    assert isinstance(report, EvaluationReport)
     return directory, model, report
 
 
 @pytest.fixture
-def copy(saved, tmp_path):
+def copy(saved: tuple[Path, LowPerformanceModel, EvaluationReport], tmp_path: Path) -> Path:
     return shutil.copytree(saved[0], tmp_path / "copy")
 
 
-def refused(call, *words):
+def refused(call: Callable[[], object], *words: str) -> None:
     with pytest.raises(InputError) as error:
         call()
     message = str(error.value)
@@ -81,11 +88,11 @@ def refused(call, *words):
         assert word in message
 
 
-def leaves(model):
+def leaves(model: Any) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(model)]
 
 
-def contents(directory):
+def contents(directory: Path) -> dict[Path, tuple[int, bytes]]:
     return {
         p.relative_to(directory): (p.stat().st_mtime_ns, p.read_bytes())
         for p in directory.rglob("*")
@@ -96,7 +103,9 @@ def contents(directory):
 # --- training
 
 
-def test_training_learns_a_closed_form(saved):
+def test_training_learns_a_closed_form(
+    saved: tuple[Path, LowPerformanceModel, EvaluationReport],
+) -> None:
     errors = saved[2].loaded
     assert errors.mean_relative["mass"] < 0.02
     assert errors.mean_relative["time"] < 0.02
@@ -105,7 +114,9 @@ def test_training_learns_a_closed_form(saved):
         assert abs(value) < 0.01
 
 
-def test_training_reduces_the_loss(data, saved):
+def test_training_reduces_the_loss(
+    data: Dataset, saved: tuple[Path, LowPerformanceModel, EvaluationReport]
+) -> None:
     description = read_description(saved[0])["training"]
     short, _ = train(ONE_EPOCH, data)
     whole = held_out(data, read_description(saved[0]))
@@ -115,7 +126,9 @@ def test_training_reduces_the_loss(data, saved):
     assert 1 <= description["best_epoch"] <= LIGHT.epochs
 
 
-def test_the_same_seed_gives_the_same_weights_and_cycles_that_are_not_valid_play_no_role(data):
+def test_the_same_seed_gives_the_same_weights_and_cycles_that_are_not_valid_play_no_role(
+    data: Dataset,
+) -> None:
     settings = dataclasses.replace(LIGHT, epochs=2, dropout=0.1, seed=4)
     done = []
     valid = np.arange(len(data)) % 15 != 0
@@ -125,15 +138,17 @@ def test_the_same_seed_gives_the_same_weights_and_cycles_that_are_not_valid_play
             data, mass=np.where(valid, data.mass, np.float32(wrong)), valid=valid
         )
         model, report = train(settings, spoilt, progress=lambda *n: done.append(n))
+        assert isinstance(report, EvaluationReport)
         assert np.isfinite(report.every.mean_relative["mass"])
         models.append(leaves(model))
     assert done == [(1, 2), (2, 2)] * 2
-    assert all(np.array_equal(a, b) for a, b in zip(*models, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(models[0], models[1], strict=True))
 
 
-def test_the_validation_part_chooses_the_weights():
+def test_the_validation_part_chooses_the_weights() -> None:
     """A learning rate that blows the network up late must not cost what was learnt before."""
-    graph, params, rest = nnx.split(PsiLow((8,), rngs=nnx.Rngs(0)), nnx.Param, ...)
+    graph, *states = nnx.split(PsiLow((8,), rngs=nnx.Rngs(0)), nnx.Param, ...)
+    params, rest = states
     optimiser = optax.sgd(1e3)
     fit = fitting.Fit(
         params, rest, optimiser.init(params), (params, rest), jnp.asarray(1e-9), jnp.asarray(7)
@@ -157,7 +172,7 @@ def test_the_validation_part_chooses_the_weights():
     assert all(np.array_equal(a, b) for a, b in zip(best, kept, strict=True))
 
 
-def test_data_that_cannot_be_trained_on_is_refused(data):
+def test_data_that_cannot_be_trained_on_is_refused(data: Dataset) -> None:
     few = data.select(data.rollout < 2)
     refused(lambda: train(LIGHT, few), "2 rollouts")
     holed = dataclasses.replace(data, time=np.where(data.rollout == 3, np.nan, data.time))
@@ -170,7 +185,9 @@ def test_data_that_cannot_be_trained_on_is_refused(data):
 # --- evaluation
 
 
-def test_the_errors_are_what_they_are_called(saved, data):
+def test_the_errors_are_what_they_are_called(
+    saved: tuple[Path, LowPerformanceModel, EvaluationReport], data: Dataset
+) -> None:
     _, model, _ = saved
     p = jax.vmap(model.of_view)(jnp.asarray(data.characteristics), jnp.asarray(data.action))
     mass, time, work = (np.asarray(v) for v in (p.mass, p.time, p.work))
@@ -183,7 +200,9 @@ def test_the_errors_are_what_they_are_called(saved, data):
     assert errors.mean_relative["work"] == pytest.approx(0.0, abs=1e-5)
 
 
-def test_empty_buckets_do_not_drown_the_relative_error(saved, data):
+def test_empty_buckets_do_not_drown_the_relative_error(
+    saved: tuple[Path, LowPerformanceModel, EvaluationReport], data: Dataset
+) -> None:
     _, model, _ = saved
     mass = data.mass.copy()
     mass[::10] = 0.0
@@ -196,7 +215,9 @@ def test_empty_buckets_do_not_drown_the_relative_error(saved, data):
     refused(lambda: evaluate_performance(model, empty), "nothing to evaluate")
 
 
-def test_only_the_test_part_of_the_training_data_is_held_out(saved, data):
+def test_only_the_test_part_of_the_training_data_is_held_out(
+    saved: tuple[Path, LowPerformanceModel, EvaluationReport], data: Dataset
+) -> None:
     description = read_description(saved[0])
     part = held_out(data, description)
     assert len(part) == saved[2].every.cycles == description["training"]["cycles"][2]
@@ -205,8 +226,10 @@ def test_only_the_test_part_of_the_training_data_is_held_out(saved, data):
     assert held_out(other, description) is other
 
 
-def test_a_data_set_that_begins_with_the_same_piles_is_noticed(data, tmp_path):
-    def of_seed(seed):
+def test_a_data_set_that_begins_with_the_same_piles_is_noticed(
+    data: Dataset, tmp_path: Path
+) -> None:
+    def of_seed(seed: int) -> Dataset:
         return dataclasses.replace(data, attributes={**data.attributes, "seed": seed})
 
     train(ONE_EPOCH, of_seed(3), out=tmp_path / "model")
@@ -220,9 +243,10 @@ def test_a_data_set_that_begins_with_the_same_piles_is_noticed(data, tmp_path):
 # --- models on disk
 
 
-def test_of_several_data_sets_each_has_its_own_test_part(data, tmp_path):
+def test_of_several_data_sets_each_has_its_own_test_part(data: Dataset, tmp_path: Path) -> None:
     other = synthetic(rollouts=20, seed=1)
     _, report = train(ONE_EPOCH, [data, other], out=tmp_path / "model")
+    assert isinstance(report, EvaluationReport)
     description = read_description(tmp_path / "model")
     parts = [held_out(each, description) for each in (data, other)]
     assert [len(set(part.rollout)) for part in parts] == [
@@ -236,12 +260,12 @@ def test_of_several_data_sets_each_has_its_own_test_part(data, tmp_path):
     np.testing.assert_array_equal(alone.mass, parts[0].mass)
 
 
-def test_data_sets_of_other_soils_are_not_joined(data):
+def test_data_sets_of_other_soils_are_not_joined(data: Dataset) -> None:
     other = dataclasses.replace(data, attributes={"soil": {"density": 1500.0}})
     refused(lambda: train(LIGHT, [data, other]), "soil")
 
 
-def test_few_cycles_far_from_the_others_do_not_spoil_the_rest(data):
+def test_few_cycles_far_from_the_others_do_not_spoil_the_rest(data: Dataset) -> None:
     random = np.random.default_rng(0)
     stalls = random.random(len(data)) < 0.03
     time = np.where(stalls, data.time + 60.0, data.time).astype(np.float32)
@@ -255,7 +279,7 @@ def test_few_cycles_far_from_the_others_do_not_spoil_the_rest(data):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_small_errors_count_by_their_square(loss):
+def test_small_errors_count_by_their_square(loss: str) -> None:
     errors = 0.05 * fitting._HUBER * jnp.array([1.0, -2.0])
     small, double = fitting.loss_of_errors(errors, loss)
     assert float(double / small) == pytest.approx(4.0, rel=0.02)
@@ -263,23 +287,29 @@ def test_small_errors_count_by_their_square(loss):
     assert float(double / large) == pytest.approx({"huber": 2.0, "squared": 4.0}[loss], rel=0.02)
 
 
-def test_a_model_comes_back_bit_by_bit_and_the_directory_stays_as_it_is(saved):
+def test_a_model_comes_back_bit_by_bit_and_the_directory_stays_as_it_is(
+    saved: tuple[Path, LowPerformanceModel, EvaluationReport],
+) -> None:
     directory, model, _ = saved
     before = contents(directory)
     loaded = load_model(directory)
-    assert jax.tree.structure(loaded) == jax.tree.structure(model)
+    assert jax.tree.structure(loaded) == jax.tree.structure(model)  # type: ignore[operator]
     for got, want in zip(leaves(loaded), leaves(model), strict=True):
         assert got.dtype == want.dtype == np.float32
         np.testing.assert_array_equal(got, want)
     assert contents(directory) == before
 
 
-def test_a_relative_path_will_do(saved, monkeypatch):
+def test_a_relative_path_will_do(
+    saved: tuple[Path, LowPerformanceModel, EvaluationReport], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(saved[0].parent)
     assert leaves(load_model(saved[0].name))
 
 
-def test_a_model_is_small_and_names_no_place_of_this_machine(saved, tmp_path):
+def test_a_model_is_small_and_names_no_place_of_this_machine(
+    saved: tuple[Path, LowPerformanceModel, EvaluationReport], tmp_path: Path
+) -> None:
     files = [path for path in saved[0].rglob("*") if path.is_file()]
     assert len(files) < 20
     assert sum(path.stat().st_size for path in files) < 100_000
@@ -287,7 +317,9 @@ def test_a_model_is_small_and_names_no_place_of_this_machine(saved, tmp_path):
     assert not any(here in path.read_bytes() for path in files)
 
 
-def test_the_description_says_where_a_model_comes_from(saved, data):
+def test_the_description_says_where_a_model_comes_from(
+    saved: tuple[Path, LowPerformanceModel, EvaluationReport], data: Dataset
+) -> None:
     description = read_description(saved[0])
     assert description["format"] == "wlplan.model/1"
     assert description["kind"] == "psi_low"
@@ -299,7 +331,9 @@ def test_the_description_says_where_a_model_comes_from(saved, data):
     assert set(description["versions"]) >= {"wlplan", "jax", "numpy"}
 
 
-def test_saving_replaces_a_model_and_nothing_else(copy, saved, tmp_path):
+def test_saving_replaces_a_model_and_nothing_else(
+    copy: Path, saved: tuple[Path, LowPerformanceModel, EvaluationReport], tmp_path: Path
+) -> None:
     (copy / "weights" / "left.over").write_text("old")
     save_model(copy, saved[1], {"note": "second"})
     assert read_description(copy)["note"] == "second"
@@ -319,10 +353,14 @@ def test_saving_replaces_a_model_and_nothing_else(copy, saved, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["copy", "file", "missing", "other"]
 
 
-def test_a_failed_save_leaves_the_old_model(copy, saved, monkeypatch):
+def test_a_failed_save_leaves_the_old_model(
+    copy: Path,
+    saved: tuple[Path, LowPerformanceModel, EvaluationReport],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     before = contents(copy)
 
-    def fails(*_):
+    def fails(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(storage, "_digests", fails)
@@ -331,7 +369,7 @@ def test_a_failed_save_leaves_the_old_model(copy, saved, monkeypatch):
     assert [p.name for p in copy.parent.iterdir()] == ["copy"]
 
 
-def test_a_bad_place_is_refused_before_the_training(data, tmp_path):
+def test_a_bad_place_is_refused_before_the_training(data: Dataset, tmp_path: Path) -> None:
     done = []
     (tmp_path / "file").write_text("")
     place = tmp_path / "file" / "b"
@@ -339,7 +377,7 @@ def test_a_bad_place_is_refused_before_the_training(data, tmp_path):
     assert not done
 
 
-def test_a_missing_or_foreign_model_is_refused(tmp_path, copy):
+def test_a_missing_or_foreign_model_is_refused(tmp_path: Path, copy: Path) -> None:
     refused(lambda: load_model(tmp_path / "nothing"), "no such model")
     refused(lambda: load_model(tmp_path), "not a model")
     document = json.loads((copy / "model.json").read_text())
@@ -352,7 +390,7 @@ def test_a_missing_or_foreign_model_is_refused(tmp_path, copy):
     refused(lambda: load_model(copy), "not a model")
 
 
-def test_every_truncated_or_missing_file_is_noticed(copy):
+def test_every_truncated_or_missing_file_is_noticed(copy: Path) -> None:
     files = [path for path in copy.rglob("*") if path.is_file() and path.name != "model.json"]
     for path in files:
         content = path.read_bytes()
@@ -373,7 +411,9 @@ def test_every_truncated_or_missing_file_is_noticed(copy):
         lambda d: d["normaliser"]["inputs"].update(low=[0.0]),
     ],
 )
-def test_a_description_that_does_not_fit_the_weights_is_refused(copy, spoil):
+def test_a_description_that_does_not_fit_the_weights_is_refused(
+    copy: Path, spoil: Callable[[dict[str, Any]], object]
+) -> None:
     document = json.loads((copy / "model.json").read_text())
     spoil(document)
     (copy / "model.json").write_text(json.dumps(document))

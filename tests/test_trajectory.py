@@ -1,6 +1,8 @@
 """The recorded motion of a loading: that of `dig`, in order, from the approach to the stop."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,8 @@ import numpy as np
 import pytest
 
 from wlplan.engines.simulator import STOP_REASONS, Settings, dig, trace
+from wlplan.engines.simulator.cycle import Cycle
+from wlplan.engines.simulator.trajectory import Trajectory
 from wlplan.site.machine import WA320
 from wlplan.terrain.heightmap import local_axes
 from wlplan.types import action_from
@@ -22,23 +26,23 @@ SLOPE = np.tan(math.radians(30.0))
 HEIGHT = jnp.asarray(np.tile(np.clip(SLOPE * ALONG[:, None], 0.0, 4.0), 52), jnp.float32)
 
 
-def played(function):
+def played(function: Callable[..., Any]) -> Any:
     """A function of surface, floor and action on all the actions."""
 
     @jax.jit
     @jax.vmap
-    def play(action):
+    def play(action: jax.Array) -> Any:
         return function(HEIGHT, jnp.zeros_like(HEIGHT), action_from(action))
 
     return jax.tree.map(np.asarray, play(jnp.asarray(ACTIONS)))
 
 
 @pytest.fixture(scope="module")
-def both():
+def both() -> tuple[Cycle, Trajectory]:
     return played(dig), played(trace)
 
 
-def test_it_ends_where_the_cycle_does(both):
+def test_it_ends_where_the_cycle_does(both: tuple[Cycle, Trajectory]) -> None:
     cycle, trajectory = both
     assert len(set(cycle.stop_reason.tolist())) > 1
     assert (trajectory.phase[:, -1] == 2).all()
@@ -53,7 +57,9 @@ def test_it_ends_where_the_cycle_does(both):
     assert STOP_REASONS[int(cycle.stop_reason[0])] == "tilt_end"
 
 
-def test_it_begins_a_metre_before_the_pile_with_an_empty_bucket_on_the_ground(both):
+def test_it_begins_a_metre_before_the_pile_with_an_empty_bucket_on_the_ground(
+    both: tuple[Cycle, Trajectory],
+) -> None:
     _, trajectory = both
     np.testing.assert_allclose(trajectory.tip_x[:, 0], -1.0, atol=1e-6)
     np.testing.assert_allclose(trajectory.tip_z[:, 0], 0.0, atol=1e-6)
@@ -61,7 +67,9 @@ def test_it_begins_a_metre_before_the_pile_with_an_empty_bucket_on_the_ground(bo
     np.testing.assert_allclose(trajectory.speed[:, 0], WA320.travel_speed)
 
 
-def test_time_and_position_go_on_step_by_step_and_the_end_repeats(both):
+def test_time_and_position_go_on_step_by_step_and_the_end_repeats(
+    both: tuple[Cycle, Trajectory],
+) -> None:
     _, trajectory = both
     steps = np.diff(trajectory.time, axis=1)
     assert (steps >= 0.0).all()
@@ -76,7 +84,7 @@ def test_time_and_position_go_on_step_by_step_and_the_end_repeats(both):
     assert (np.diff(trajectory.mass, axis=1) > -1.0).all()
 
 
-def test_a_batch_equals_its_members(both):
+def test_a_batch_equals_its_members(both: tuple[Cycle, Trajectory]) -> None:
     _, trajectory = both
     alone = jax.jit(trace)(HEIGHT, jnp.zeros_like(HEIGHT), action_from(jnp.asarray(ACTIONS[1])))
     for one, all_ in zip(jax.tree.leaves(alone), jax.tree.leaves(trajectory), strict=True):

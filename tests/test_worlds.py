@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,40 +11,45 @@ import pytest
 
 import wlplan
 from wlplan.errors import InputError
+from wlplan.models.ensemble import Ensemble
 from wlplan.models.storage import load_model
 from wlplan.planning.plan import play
 from wlplan.terrain.automaton import Schedule, relax
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
-from wlplan.types import Action, LoadingPlan, Performance
+from wlplan.types import Action, LoadingPlan, LocalHeightmap, Performance, Pile, Pose
 from wlplan.worlds.capabilities import as_pytree, is_differentiable, with_derivatives
 from wlplan.worlds.library import load_world, pretrained_path
 from wlplan.worlds.names import ENGINES, FOR_PLANNING, WORLDS
 from wlplan.worlds.pile_states import LocalChange, Strip
 
+Scene = tuple[Pile, Pose, Action]
+
 DENSITY = 1.727  # of gravel [tonne/m^3]
 
 
 @pytest.fixture(scope="module")
-def scene():
+def scene() -> Scene:
     """A relaxed cone, and a pose and an action of one loading on it."""
     pile = jax.jit(relax)(seed_pile("conical", slope=np.radians(30.0), height=2.0))
     pose = jax.tree.map(lambda leaf: jnp.float32(leaf[0]), edge_poses(toe_contour(pile), 1))
     return pile, pose, Action(*(jnp.float32(v) for v in (0.4, 2.0, 0.3, 3.0)))
 
 
-def removed(before, after):
+def removed(before: Pile, after: Pile) -> float:
     heights = (np.asarray(pile.height, np.float64).sum() for pile in (before, after))
-    return -np.subtract(*reversed(list(heights))) * before.cell_size**2 * DENSITY
+    return -float(np.subtract(*reversed(list(heights)))) * before.cell_size**2 * DENSITY
 
 
 @pytest.mark.parametrize(
     ("psi", "phi"), list(itertools.product(["psi_low", "psi_high"], [None, "phi"])), ids=str
 )
-def test_every_predictor_goes_with_every_pile_state(scene, psi, phi):
+def test_every_predictor_goes_with_every_pile_state(
+    scene: Scene, psi: str, phi: str | None
+) -> None:
     pile, pose, action = scene
     model = load_model(pretrained_path(psi), psi)
-    state = Strip() if phi is None else load_model(pretrained_path(phi), phi)
+    state: Any = Strip() if phi is None else load_model(pretrained_path(phi), phi)
     world = wlplan.LearnedWorld(model, state)
     after, performance = world(pile, pose, action)
     assert 0.5 < float(performance.mass) < 8.0
@@ -54,23 +60,26 @@ def test_every_predictor_goes_with_every_pile_state(scene, psi, phi):
     np.testing.assert_array_equal(named(pile, pose, action)[0].height, after.height)
 
 
-def test_a_function_is_a_pile_state(scene):
+def test_a_function_is_a_pile_state(scene: Scene) -> None:
     """φ of one's own: lowers the whole map alike, and says that it keeps the volume."""
     pile, pose, action = scene
 
-    def lowered(local, action, volume, ground):
+    def lowered(
+        local: LocalHeightmap, action: jax.Array, volume: jax.Array, ground: jax.Array
+    ) -> jax.Array:
         above = jnp.maximum(local.height - ground, 0.0)
         return -above * volume / (0.01 * above.sum())
 
     model = load_model(pretrained_path("psi_high"), "psi_high")
-    lowered.conserves_volume = True
-    world = wlplan.LearnedWorld(model, LocalChange(jax.tree_util.Partial(lowered)))
+    lowered.conserves_volume = True  # type: ignore[attr-defined]
+    partial: Any = jax.tree_util.Partial(lowered)
+    world = wlplan.LearnedWorld(model, LocalChange(partial))
     # A partial hides the attribute: the load is then what was predicted.
     after, performance = world(pile, pose, action)
     assert removed(pile, after) == pytest.approx(float(performance.mass), rel=0.02)
 
 
-def test_a_pile_state_where_a_predictor_belongs_is_refused():
+def test_a_pile_state_where_a_predictor_belongs_is_refused() -> None:
     with pytest.raises(InputError, match=r"is a phi: name a model that `wlplan train psi-low`"):
         load_world("low", model=pretrained_path("phi"))
     with pytest.raises(InputError, match=r"is a psi_low: name a model that `wlplan train phi`"):
@@ -81,18 +90,18 @@ def test_a_pile_state_where_a_predictor_belongs_is_refused():
         load_world("moon")
 
 
-def test_the_names_are_those_that_load():
+def test_the_names_are_those_that_load() -> None:
     assert set(FOR_PLANNING) | set(ENGINES) == set(WORLDS)
     for name in WORLDS:
         assert callable(load_world(name))
 
 
-def test_worlds_say_whether_they_have_a_derivative():
+def test_worlds_say_whether_they_have_a_derivative() -> None:
     said = {name: is_differentiable(load_world(name)) for name in WORLDS}
     assert said == {"low": True, "hybrid": True, "high": True, "simulator": False, "dem": False}
     assert is_differentiable(with_derivatives(load_world("simulator"))) is True
 
-    def mine(pile, pose, action):
+    def mine(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         return pile, Performance(pose.x, pose.y, pose.heading)
 
     assert is_differentiable(mine) is None
@@ -101,28 +110,32 @@ def test_worlds_say_whether_they_have_a_derivative():
     assert is_differentiable(wlplan.world(mine, differentiable=False)) is False
 
 
-def test_worlds_say_whether_they_have_an_uncertainty(scene):
-    def mine(pile, pose, action):
+def test_worlds_say_whether_they_have_an_uncertainty(scene: Scene) -> None:
+    def mine(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         return pile, Performance(pose.x, pose.y, pose.heading)
 
-    def deviation(pile, pose, action):
+    def deviation(pile: Pile, pose: Pose, action: Action) -> Performance:
         return Performance(0.1 * pose.x, pose.y, pose.heading)
 
-    assert load_world("low").has_uncertainty
+    low = load_world("low")
+    assert isinstance(low, wlplan.LearnedWorld)
+    assert low.has_uncertainty
     assert not getattr(load_world("simulator"), "has_uncertainty", False)
     plain, sure = wlplan.world(mine), wlplan.world(mine, uncertainty=deviation)
     assert (plain.has_uncertainty, sure.has_uncertainty) == (False, True)
     assert float(sure.uncertainty(*scene).mass) == pytest.approx(0.1 * float(scene[1].x))
     with pytest.raises(InputError, match="uncertainty"):
         plain.uncertainty(*scene)
-    single = load_model(pretrained_path("psi_low"), "psi_low").members
+    ensemble = load_model(pretrained_path("psi_low"), "psi_low")
+    assert isinstance(ensemble, Ensemble)
+    single = ensemble.members
     one = single.replace(params=jax.tree.map(lambda leaf: leaf[0], single.params))
     assert not wlplan.LearnedWorld(one).has_uncertainty
 
 
 @pytest.mark.parametrize("name", ["low", "high", "simulator"])
-def test_a_solve_is_a_call_that_says_how_it_ended(scene, name):
-    world = load_world(name)
+def test_a_solve_is_a_call_that_says_how_it_ended(scene: Scene, name: str) -> None:
+    world: Any = load_world(name)
     after, performance, report = world.solve(*scene)
     same, also = world(*scene)
     np.testing.assert_array_equal(after.height, same.height)
@@ -133,18 +146,22 @@ def test_a_solve_is_a_call_that_says_how_it_ended(scene, name):
     assert abs(float(report.missing)) < 1e-4
 
 
-def test_a_played_plan_says_how_its_solves_ended(scene):
+def test_a_played_plan_says_how_its_solves_ended(scene: Scene) -> None:
     pile, pose, action = scene
     plan = LoadingPlan(*jax.tree.map(lambda leaf: leaf[None], (pose, action)))
-    patient = play(load_world("low"), pile, plan).solves
+    low = load_world("low")
+    assert isinstance(low, wlplan.LearnedWorld)
+    patient = play(low, pile, plan).solves
+    assert patient is not None
     assert patient.settled.tolist() == [True]
     hasty = dataclasses.replace(Schedule(), most_rounds=1)
-    ended = play(load_world("low").replace(schedule=hasty), pile, plan).solves
+    ended = play(low.replace(schedule=hasty), pile, plan).solves
+    assert ended is not None
     assert ended.rounds.tolist() == [1]
     assert ended.settled.tolist() == [False]
     assert np.degrees(ended.steepest_slope[0]) > 33.5
 
 
-def test_a_world_can_be_jitted_as_it_is(scene):
+def test_a_world_can_be_jitted_as_it_is(scene: Scene) -> None:
     world = load_world("low")
     np.testing.assert_allclose(jax.jit(world)(*scene)[0].height, world(*scene)[0].height, atol=1e-6)

@@ -1,19 +1,24 @@
 """A law of every training: killed, it goes on where it was and ends with the same weights."""
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
-from wlplan.training import fitting, train
+from wlplan.dataset import Dataset
+from wlplan.training import Settings, fitting, train
 
 
 class KilledError(Exception):
     """What ends a training in the middle."""
 
 
-def check_that_a_killed_one_ends_alike(data, folder, monkeypatch, settings, **other):
+def check_that_a_killed_one_ends_alike(
+    data: Dataset, folder: Path, monkeypatch: pytest.MonkeyPatch, settings: Settings, **other: Any
+) -> None:
     """Trains whole, and killed after two of four epochs and again.
 
     Args:
@@ -26,11 +31,11 @@ def check_that_a_killed_one_ends_alike(data, folder, monkeypatch, settings, **ot
     monkeypatch.setattr(fitting, "_SAVE_EVERY", 0.0)
     whole, _ = train(settings, data, out=folder / "whole")
 
-    def killed(done, _):
+    def killed(done: int, _: int) -> None:
         if done == 2:
             raise KilledError
 
-    def epochs(settings):
+    def epochs(settings: Settings) -> tuple[Any, list[tuple[int, ...]]]:
         seen = []
         model, _ = train(settings, data, out=folder / "m", progress=lambda *n: seen.append(n))
         return model, seen
