@@ -1,17 +1,22 @@
 """The code blocks of README and docs/ are tests: `make test-slow` runs them.
 
-Python blocks run, one after the other in one namespace a page. Shell blocks are not run, for some
-would take hours: every `wlplan` command has to parse, every target of make and every extra of pip
-has to exist. TOML blocks are read as what their first line calls them.
+Python blocks run, one after the other in one namespace a page, in a folder that holds a scan and
+models for them. Shell blocks are not run, for some would take hours: every `wlplan` command has to
+parse, every target of make, every extra of pip and every module of Python has to exist. TOML blocks
+are read as what their first line calls them, and written for the blocks after.
 """
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import re
 import shlex
+import shutil
 import tempfile
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sybil import Example, Sybil
@@ -23,7 +28,8 @@ ROOT = Path(__file__).parent
 def check_shell(example: Example) -> None:
     """Looks at every line of a shell block."""
     text = re.sub(r"\\\n\s*", " ", str(example.parsed))
-    for line in text.splitlines():
+    # A number stands for variables of a scheduler.
+    for line in re.sub(r"\$\w+", "3", text).splitlines():
         words = shlex.split(line, comments=True)
         if words:
             check_command(words)
@@ -40,29 +46,57 @@ def check_command(words: list[str]) -> None:
             assert command is not None
             command.make_context(name, arguments, parent=context)
     elif program == "make":
-        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        targets = re.findall(r"^([\w-]+)[\w -]*:", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert set(rest) <= set(targets), f"no such target: {rest}"
     elif program == "pip":
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
         extras = re.findall(r"\[([\w,]+)\]", " ".join(rest))
         wanted = {extra for group in extras for extra in group.split(",")}
         assert wanted <= set(project["optional-dependencies"]), f"no such extra: {wanted}"
+    elif program == "python":
+        assert rest[0] == "-m"
+        assert importlib.util.find_spec(rest[1]) is not None, f"no such module: {rest[1]}"
     else:
         raise AssertionError(f"{program}: do not know how to check it; skip the block")
 
 
 def check_toml(example: Example) -> None:
-    """Reads a TOML block as the machine or the soil that its first line names."""
+    """Reads a TOML block as the machine or the soil that its first line names, and writes it."""
     from wlplan.site.presets import machine_named, soil_named
 
     text = str(example.parsed)
     tomllib.loads(text)
-    named = re.match(r"# my-(loader|soil)\.toml", text)
-    if named:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "given.toml"
-            path.write_text(text)
-            (machine_named if named[1] == "loader" else soil_named)(path)
+    if named := re.match(r"# (my-(loader|soil)\.toml)", text):
+        Path(named[1]).write_text(text)
+        (machine_named if named[2] == "loader" else soil_named)(named[1])
+
+
+def enter_folder(namespace: dict[str, Any]) -> None:
+    """A folder with what the pages speak of: a scan as `scan.tif`, and the models that ship."""
+    namespace["_back"], namespace["_folder"] = os.getcwd(), tempfile.mkdtemp()
+    os.chdir(namespace["_folder"])
+    import rasterio
+
+    import wlplan
+    from wlplan.worlds.library import pretrained_path
+
+    pile = wlplan.seed_pile("conical", slope=0.5, height=2.0)
+    north_up = pile.height.T[::-1]
+    west, south = (float(v) - 0.05 for v in pile.origin)
+    step = rasterio.Affine(0.1, 0.0, west, 0.0, -0.1, south + 0.1 * len(north_up))
+    shape = {"height": north_up.shape[0], "width": north_up.shape[1], "count": 1}
+    with rasterio.open(
+        "scan.tif", "w", driver="GTiff", dtype="float32", transform=step, **shape
+    ) as file:
+        file.write(north_up, 1)
+    for name, kind in (("my-psi-low", "psi_low"), ("my-psi-high", "psi_high"), ("my-phi", "phi")):
+        shutil.copytree(pretrained_path(kind), name)
+
+
+def leave_folder(namespace: dict[str, Any]) -> None:
+    """Back to where the tests run."""
+    os.chdir(namespace["_back"])
+    shutil.rmtree(namespace["_folder"])
 
 
 pytest_collect_file = Sybil(
@@ -73,6 +107,8 @@ pytest_collect_file = Sybil(
         SkipParser(),
     ],
     filenames=["README.md", "CONTRIBUTING.md", *(path.name for path in ROOT.glob("docs/*.md"))],
+    setup=enter_folder,
+    teardown=leave_folder,
 ).pytest()
 
 
