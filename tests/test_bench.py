@@ -283,7 +283,7 @@ def test_one_item_as_a_file_and_as_json(run: Run, tmp_path: Path) -> None:
     assert code == 0
     assert out == (tmp_path / "out" / "bench.json").read_text()
     document = strict_json(out)
-    assert document["format"] == "wlplan.studies.bench/1"
+    assert document["format"] == "wlplan.bench/1"
     assert document["device"]["cores"] >= 1
     assert document["versions"]["jax"] == jax.__version__
     assert [record["name"] for record in document["items"]] == ["psi-low", "gpu-rollouts", "plan"]

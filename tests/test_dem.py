@@ -651,7 +651,7 @@ def test_a_plan_is_played_load_by_load(
         assert load["simulated"]["time"] == pytest.approx(9.0)
         assert load["cycle"]["stop_reason"] == "breakout"
         assert load["transport"]["time"] > 0.0
-    assert "elements 2/2" in err
+    assert "dem 2/2" in err
     # The same command again plays nothing.
     count = len(jobs)
     assert cli.main(["simulate", *files, "--engine", "dem"]) == 0

@@ -248,7 +248,8 @@ def simulate(
                 record=keep,
             )
         )
-        progress(engine, count, count, None)
+        if not cycles:
+            progress(engine, count, count, None)
 
     predicted = _predicted_of(given)
     document = plan_document(

@@ -85,8 +85,12 @@ def simulator_changes(data: Mapping[str, Any]) -> list[str]:
     wrong = []
     for name in _SETTINGS:
         now = json.loads(json.dumps(dataclasses.asdict(getattr(simulator, name))))
-        then = data.get(name, {})
-        changed = sorted(key for key in {*now, *then} if now.get(key) != then.get(key))
+        then = data.get(name)
+        if not then:
+            wrong.append(f"{name} was not recorded")
+            continue
+        # A field that came later had no say: everything was as it is by default.
+        changed = sorted(key for key in then if now.get(key) != then[key])
         wrong += [f"{name}.{k} was {then.get(k)}, is {now.get(k)}" for k in changed]
     probes = data.get("probes")
     if not probes:

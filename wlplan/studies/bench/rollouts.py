@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import jax
 import numpy as np
@@ -15,6 +16,7 @@ from wlplan.terrain.characteristics import as_vector, characteristics
 from wlplan.terrain.heightmap import sample_local
 from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.types import LoadingPlan, Performance, Pile, World, action_from
+from wlplan.worlds.learned import LearnedWorld
 
 _LOCATIONS = 150  # of a batch of inferences
 _ROLLOUTS = 1024  # of a batch on a GPU
@@ -63,8 +65,8 @@ def _characteristics(setup: Setup, count: int) -> tuple[Array, Array]:
 
 
 def _predictor(setup: Setup) -> Callable[[Array, Array], Performance]:
-    model = setup.world.model  # type: ignore[attr-defined]
-    return lambda characteristics, action: model(characteristics, action)
+    model = cast(LearnedWorld, setup.world).performance
+    return lambda characteristics, action: model.of_view(characteristics, action)
 
 
 def _measure_psi_low(setup: Setup) -> Measured:
