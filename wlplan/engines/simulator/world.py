@@ -40,7 +40,7 @@ class Simulator(struct.PyTreeNode):
         The loader stands on the floor at the dig location, level; a floor that rises into the
         pile limits the cut from below. The pile is relaxed; the work includes the wheels' slip.
         """
-        after, performance, _ = _solve(self, pile, pose, action)
+        (after, performance, _), _ = _load(self, pile, pose, action)
         return after, performance
 
     @property
@@ -56,7 +56,7 @@ class Simulator(struct.PyTreeNode):
         self, pile: Pile, pose: Pose, action: Action
     ) -> tuple[Pile, Performance, SolveReport]:
         """One loading as by calling it, and how the automaton ended."""
-        solved: tuple[Pile, Performance, SolveReport] = _solve(self, pile, pose, action)
+        solved: tuple[Pile, Performance, SolveReport] = _load(self, pile, pose, action)[0]
         return solved
 
     def play(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance, Cycle]:
@@ -70,16 +70,7 @@ class Simulator(struct.PyTreeNode):
         Returns:
             The pile after, relaxed; the performance; and the record of the cycle in SI units.
         """
-        height, ground = self.view(pile, pose)
-        cycle = dig(
-            height,
-            ground,
-            action,
-            machine=self.machine,
-            soil=self.soil,
-            settings=self.settings,
-        )
-        after, performance, _ = self.leave(pile, pose, height, cycle)
+        (after, performance, _), cycle = _load(self, pile, pose, action)
         return after, performance, cycle
 
     def view(self, pile: Pile, pose: Pose) -> tuple[Float[Array, "52 52"], Float[Array, "52 52"]]:
@@ -127,9 +118,10 @@ class Simulator(struct.PyTreeNode):
 
 
 @jax.jit
-def _solve(
+def _load(
     simulator: Simulator, pile: Pile, pose: Pose, action: Action
-) -> tuple[Pile, Performance, SolveReport]:
+) -> tuple[tuple[Pile, Performance, SolveReport], Cycle]:
+    """One loading, and the record of its cycle."""
     height, ground = simulator.view(pile, pose)
     cycle = dig(
         height,
@@ -139,4 +131,4 @@ def _solve(
         soil=simulator.soil,
         settings=simulator.settings,
     )
-    return simulator.leave(pile, pose, height, cycle)
+    return simulator.leave(pile, pose, height, cycle), cycle
