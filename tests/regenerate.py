@@ -44,7 +44,7 @@ def path_of(record: np.ndarray) -> np.ndarray:
     return path
 
 
-def small(heights: Any) -> np.ndarray:
+def small(heights: npt.ArrayLike) -> np.ndarray:
     """Heights in whole millimetres."""
     return np.round(1000.0 * np.asarray(heights)).astype(np.int16)
 

@@ -2,13 +2,14 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy import ndimage, stats
 
@@ -24,6 +25,9 @@ from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
 from wlplan.terrain.toe import ToeContour, toe_contour
 from wlplan.types import Action, Performance, Pile, Pose, action_from
 
+# Surfaces and actions -> their cycles.
+Rows = Sequence[npt.ArrayLike] | np.ndarray
+Digs = Callable[[Rows, Rows], Cycle]
 Played = tuple[Pile, Performance, Cycle]
 Loadings = tuple[
     Callable[..., Played], tuple[Pile, Pose, Action], Played, tuple[slice, slice, slice]
@@ -236,9 +240,7 @@ def bumpy(seed: int, slope: float = 26.0) -> np.ndarray:
     return bumps.astype(np.float32)
 
 
-def batched(
-    step: float = 0.02, machine: WheelLoader = WA320, batch: int = BATCH
-) -> Callable[[Any, Any], Cycle]:
+def batched(step: float = 0.02, machine: WheelLoader = WA320, batch: int = BATCH) -> Digs:
     """`dig` over lists of surfaces and actions, compiled for batches of one size."""
 
     @jax.jit
@@ -252,7 +254,7 @@ def batched(
             machine=machine,
         )
 
-    def call(heights: Any, actions: Any) -> Cycle:
+    def call(heights: Rows, actions: Rows) -> Cycle:
         heights, actions = np.array(heights, np.float32), np.array(actions, np.float32)
         n = len(actions)
         assert n <= batch
@@ -266,7 +268,7 @@ def batched(
 
 
 @pytest.fixture(scope="module")
-def digs() -> Callable[[Any, Any], Cycle]:
+def digs() -> Digs:
     return batched()
 
 
@@ -284,7 +286,7 @@ ENDS = {
 
 
 @pytest.fixture(scope="module")
-def ends(digs: Callable[[Any, Any], Cycle]) -> dict[str, Cycle]:
+def ends(digs: Digs) -> dict[str, Cycle]:
     cycles = digs([h for h, _ in ENDS.values()], [a for _, a in ENDS.values()])
     return {r: jax.tree.map(lambda v, k=k: v[k], cycles) for k, r in enumerate(ENDS)}
 
@@ -314,7 +316,7 @@ def pin_height() -> float:
     return WA320.pivot_height + WA320.boom_length * math.sin(WA320.boom_low)
 
 
-def test_no_dig_goes_past_an_event(digs: Callable[[Any, Any], Cycle]) -> None:
+def test_no_dig_goes_past_an_event(digs: Digs) -> None:
     rng = np.random.default_rng(1)
     cycle = digs([bumpy(k) for k in range(BATCH)], random_actions(rng, BATCH))
     assert (cycle.tip_x <= 3.2 + 1e-3).all()
@@ -324,7 +326,7 @@ def test_no_dig_goes_past_an_event(digs: Callable[[Any, Any], Cycle]) -> None:
     np.testing.assert_allclose(cycle.tip_x[reached], 3.2, atol=1e-3)
 
 
-def test_left_and_right_are_alike(digs: Callable[[Any, Any], Cycle]) -> None:
+def test_left_and_right_are_alike(digs: Digs) -> None:
     rng = np.random.default_rng(2)
     surfaces, actions = [bumpy(k) for k in range(20)], random_actions(rng, 20)
     assert max(np.abs(h - h[:, ::-1]).max() for h in surfaces) > 0.1
@@ -338,7 +340,7 @@ def test_left_and_right_are_alike(digs: Callable[[Any, Any], Cycle]) -> None:
     assert difference.max() < 2e-2
 
 
-def test_the_local_ledger_closes(digs: Callable[[Any, Any], Cycle]) -> None:
+def test_the_local_ledger_closes(digs: Digs) -> None:
     rng = np.random.default_rng(3)
     surfaces = np.array([bumpy(k) for k in range(20)])
     cycle = digs(surfaces, random_actions(rng, 20))
@@ -346,13 +348,13 @@ def test_the_local_ledger_closes(digs: Callable[[Any, Any], Cycle]) -> None:
     np.testing.assert_allclose(lost * 0.01 * GRAVEL.density, cycle.mass, rtol=2e-5)
 
 
-def test_the_local_surface_stays_above_the_ground(digs: Callable[[Any, Any], Cycle]) -> None:
+def test_the_local_surface_stays_above_the_ground(digs: Digs) -> None:
     rng = np.random.default_rng(3)
     cycle = digs([bumpy(k) for k in range(20)], random_actions(rng, 20))
     assert cycle.height.min() >= -1e-5
 
 
-def test_a_smaller_time_step_changes_little(digs: Callable[[Any, Any], Cycle]) -> None:
+def test_a_smaller_time_step_changes_little(digs: Digs) -> None:
     rng = np.random.default_rng(4)
     surfaces, actions = [bumpy(k) for k in range(24)], random_actions(rng, 24)
     coarse = digs(surfaces, actions)
@@ -368,30 +370,40 @@ def test_a_smaller_time_step_changes_little(digs: Callable[[Any, Any], Cycle]) -
         assert np.mean(change > 0.05) <= 0.15
 
 
-def test_a_steeper_slope_loads_more_a_second(digs: Callable[[Any, Any], Cycle]) -> None:
+def test_a_steeper_slope_loads_more_a_second(digs: Digs) -> None:
     slopes = (15.0, 20.0, 25.0, 30.0)
-    actions = [MODERATE, [0.2, 2.0, 0.3, 2.0], [0.5, 3.0, 0.4, 3.0], [0.3, 1.5, 0.2, 1.0]]
+    actions: list[npt.ArrayLike] = [
+        MODERATE,
+        [0.2, 2.0, 0.3, 2.0],
+        [0.5, 3.0, 0.4, 3.0],
+        [0.3, 1.5, 0.2, 1.0],
+    ]
     cycle = digs([ramp(s) for s in slopes for _ in actions], actions * len(slopes))
     productivity = (cycle.mass / cycle.time).reshape(len(slopes), -1).mean(axis=1)
     assert np.all(np.diff(productivity) > 0.0), productivity
 
 
-def test_head_on_loads_more_a_second_than_aslant(digs: Callable[[Any, Any], Cycle]) -> None:
+def test_head_on_loads_more_a_second_than_aslant(digs: Digs) -> None:
     angles = (0.0, 20.0, 40.0)
-    actions = [MODERATE, [0.2, 2.0, 0.3, 2.0], [0.5, 3.0, 0.4, 3.0], [0.3, 1.5, 0.2, 1.0]]
+    actions: list[npt.ArrayLike] = [
+        MODERATE,
+        [0.2, 2.0, 0.3, 2.0],
+        [0.5, 3.0, 0.4, 3.0],
+        [0.3, 1.5, 0.2, 1.0],
+    ]
     cycle = digs([ramp(28.0, a) for a in angles for _ in actions], actions * len(angles))
     productivity = (cycle.mass / cycle.time).reshape(len(angles), -1).mean(axis=1)
     assert productivity[0] > productivity[2], productivity
 
 
-def test_tilting_later_fills_more(digs: Callable[[Any, Any], Cycle]) -> None:
+def test_tilting_later_fills_more(digs: Digs) -> None:
     thresholds = np.linspace(0.15, 0.5, 8)
     cycle = digs([ramp(28.0)] * 8, [[0.7, 0.0, t, 3.0] for t in thresholds])
     assert cycle.mass[-1] > 1.15 * cycle.mass[0], cycle.mass
     assert stats.spearmanr(thresholds, cycle.mass).statistic > 0.9
 
 
-def test_a_drive_into_nothing_has_a_closed_form(digs: Callable[[Any, Any], Cycle]) -> None:
+def test_a_drive_into_nothing_has_a_closed_form(digs: Digs) -> None:
     """Approach and penetration at a steady speed, tilt, brake, and the way back."""
     cycle = digs([np.zeros((52, 52))], [[0.7, 0.0, 0.7, 0.0]])
     speed, weight = WA320.travel_speed, WA320.mass * GRAVITY
@@ -527,7 +539,7 @@ def test_what_stands_over_the_side_plates_falls_beside_the_bucket(width: float) 
     np.testing.assert_array_equal(columns, [max(lanes.first - 1, 0), min(lanes.end, 51)])
 
 
-def test_cycles_advanced_in_parts_end_alike(digs: Callable[[Any, Any], Cycle]) -> None:
+def test_cycles_advanced_in_parts_end_alike(digs: Digs) -> None:
     """A few steps at a time, in one go, and next to others that took longer: the same bytes."""
     rng = np.random.default_rng(5)
     height = jnp.asarray(np.stack([bumpy(k) for k in range(8)], axis=-1))
