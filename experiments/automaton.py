@@ -69,8 +69,7 @@ def run(preset: str) -> dict[str, Any]:
     for name, schedule in SCHEDULES.items():
         if smoke and name not in SMOKE_SCHEDULES:
             continue
-        run_schedule = jax.jit(functools.partial(settle, schedule=schedule))
-        rows.append(_judged(name, run_schedule, schedule, digs, references, smoke))
+        rows.append(_judged(name, _settles(schedule), schedule, digs, references, smoke))
     taken = [float((dig.before.height - dig.dug.height).sum()) for dig in digs]
     largest = int(np.argmax(taken))
     return {
@@ -173,20 +172,14 @@ def _judged(
     return row
 
 
+def _settles(schedule: Schedule) -> Callable[[Pile], Pile]:
+    return jax.jit(lambda pile: settle(pile, schedule=schedule).pile)
+
+
 def _rounds(digs: list[Dig], schedule: Schedule) -> list[int]:
-    """Rounds that each dig takes, counted by making one at a time."""
-    one = jax.jit(functools.partial(settle, schedule=dataclasses.replace(schedule, most_rounds=1)))
-    counts = []
-    for dig in digs:
-        window, count = dig.dug, 0
-        while count < schedule.most_rounds:
-            after = one(window)
-            # A window within the tolerance is returned as it is.
-            if np.array_equal(after.height, window.height):
-                break
-            window, count = after, count + 1
-        counts.append(count)
-    return counts
+    """Rounds that each dig takes."""
+    rounds = jax.jit(lambda pile: settle(pile, schedule=schedule).rounds)
+    return [int(rounds(dig.dug)) for dig in digs]
 
 
 def _spread(values: Sequence[float]) -> dict[str, float]:
@@ -226,7 +219,7 @@ def _profile(dig: Dig, reference: np.ndarray) -> dict[str, list[float]]:
     surfaces = {
         "before": dig.before.height,
         "dug": dig.dug.height,
-        "settled": jax.jit(settle)(dig.dug).height,
+        "settled": _settles(DEFAULT_SCHEDULE)(dig.dug).height,
         "converged": jnp.asarray(reference, jnp.float32),
     }
     lines = {name: sample(surface, dig.dug, x, y) for name, surface in surfaces.items()}
