@@ -60,7 +60,7 @@ test-slow: $(VENV)/.engine
 
 # What a user touches; other versions of the libraries show there first.
 EDGE_TESTS := $(addprefix tests/test_,package.py api.py outside.py io.py planner.py rollout.py worlds.py)
-NEWEST_PYTHON := $(shell for v in 3.14 3.13 3.12 3.11; do command -v python$$v && break; done | head -n 1)
+NEWEST_PYTHON := $(shell for v in 3.14 3.13 3.12 3.11; do python$$v -c "" 2>/dev/null && command -v python$$v && break; done | head -n 1)
 
 $(VENV)-lowest/.tools: $(VENV)/.tools
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(VENV)-lowest
