@@ -78,7 +78,7 @@ def enter_folder(namespace: dict[str, Any]) -> None:
     import rasterio
 
     import wlplan
-    from wlplan.worlds.library import pretrained_path
+    from wlplan.worlds.shipped import pretrained_path
 
     pile = wlplan.seed_pile("conical", slope=0.5, height=2.0)
     north_up = pile.height.T[::-1]

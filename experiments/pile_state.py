@@ -30,7 +30,7 @@ from wlplan.terrain.heightmap import STATE_DISPLACEMENT
 from wlplan.training import PhiSettings, PhiVaeSettings, Settings
 from wlplan.training.pile_state import misplaced_volume, pile_state_errors, predict_pile_state
 from wlplan.types import LocalHeightmap
-from wlplan.worlds.library import pretrained_path
+from wlplan.worlds.shipped import pretrained_path
 
 # Trainings of our φ; of the paper's, which takes a quarter of an hour, one.
 SEEDS = 5

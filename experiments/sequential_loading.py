@@ -34,7 +34,7 @@ from wlplan.studies.paper import SEQUENCE, SEQUENCE_LOADS
 from wlplan.training import PhiSettings, PsiHighSettings, PsiLowSettings, Settings
 from wlplan.types import Action, Performance, Pile, Pose, World, action_from
 from wlplan.worlds.learned import LearnedWorld
-from wlplan.worlds.library import load_world
+from wlplan.worlds.shipped import load_world
 
 # Another seed than that of the data set: other noise, poses and actions.
 SEED, PILES, LOADS = 1000, 10, 40

@@ -30,7 +30,7 @@ from wlplan.site.soil import GRAVEL, SAND, Soil
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose, Rollout
-from wlplan.worlds import library as worlds
+from wlplan.worlds import shipped as worlds
 
 # Exit code, stdout and stderr of words of the command line.
 Run = Callable[..., tuple[int, str, str]]

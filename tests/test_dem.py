@@ -29,7 +29,7 @@ from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, SAND, Soil
 from wlplan.terrain.heightmap import local_axes
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
-from wlplan.worlds.library import load_world
+from wlplan.worlds.shipped import load_world
 
 STEP = 0.01
 

@@ -17,7 +17,7 @@ from wlplan.models.storage import load_model, read_description
 from wlplan.studies.bench.inference import BATCH
 from wlplan.studies.paper import PERFORMANCE, PILE_STATE, SEQUENCE, SEQUENCE_LOADS
 from wlplan.training import evaluate_performance, evaluate_pile_state
-from wlplan.worlds.library import pretrained_path
+from wlplan.worlds.shipped import pretrained_path
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ from wlplan.studies.gradcheck import (
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import toe_contour
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
-from wlplan.worlds import library as worlds
+from wlplan.worlds import shipped as worlds
 from wlplan.worlds.capabilities import with_derivatives
 
 

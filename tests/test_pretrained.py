@@ -22,8 +22,8 @@ from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.training import Settings, train_all, weights
 from wlplan.types import action_from
 from wlplan.worlds.learned import LearnedWorld
-from wlplan.worlds.library import load_world, pretrained_path
 from wlplan.worlds.names import WORLDS, Learned
+from wlplan.worlds.shipped import load_world, pretrained_path
 
 LEARNED = {name: world for name, world in WORLDS.items() if isinstance(world, Learned)}
 SHIPPED = sorted({kind for kinds in LEARNED.values() for kind in kinds if kind})

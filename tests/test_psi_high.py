@@ -23,7 +23,7 @@ from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.training import EvaluationReport, PsiHighSettings, train
 from wlplan.types import LocalHeightmap, action_from
-from wlplan.worlds.library import load_world
+from wlplan.worlds.shipped import load_world
 
 LOW = np.array([0.1, 0.0, -0.25, -0.25, 0.0, 0.0, 0.0, 0.0], np.float32)
 HIGH = np.array([0.6, 1.8, 0.4, 0.45, 0.7, 5.0, 0.7, 5.0], np.float32)

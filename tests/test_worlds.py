@@ -19,9 +19,9 @@ from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.types import Action, LoadingPlan, LocalHeightmap, Performance, Pile, Pose
 from wlplan.worlds.capabilities import as_pytree, is_differentiable, with_derivatives
-from wlplan.worlds.library import load_world, pretrained_path
 from wlplan.worlds.names import ENGINES, FOR_PLANNING, WORLDS
 from wlplan.worlds.pile_states import LocalChange, Strip
+from wlplan.worlds.shipped import load_world, pretrained_path
 
 Scene = tuple[Pile, Pose, Action]
 

@@ -43,6 +43,6 @@ from .types import Rollout as Rollout
 from .types import World as World
 from .worlds.capabilities import world as world
 from .worlds.learned import LearnedWorld as LearnedWorld
-from .worlds.library import load_world as load_world
+from .worlds.shipped import load_world as load_world
 
 __version__: str

@@ -25,7 +25,7 @@ from wlplan.training.settings import (
     PsiLowSettings,
     Settings,
 )
-from wlplan.worlds.library import pretrained_path
+from wlplan.worlds.shipped import pretrained_path
 
 # Passes over the data with which the paper's ψ_high is trained: 9 s of processor time each.
 CONVOLUTIONAL_EPOCHS = 60

@@ -215,7 +215,7 @@ def world_named(
         model: Folder of a ψ instead of the one that ships with the package.
         pile_state: Folder of a φ likewise.
     """
-    from wlplan.worlds.library import load_world
+    from wlplan.worlds.shipped import load_world
 
     if name not in WORLDS:
         world: World = _outside(name)
@@ -264,7 +264,7 @@ def _outside(reference: str) -> Any:
 def _remark_on_training(kind: str | None, model: str | None, site: NamedSite) -> bool:
     """Remarks if a model was trained for another soil or machine than those of a site."""
     from wlplan.models.storage import read_description
-    from wlplan.worlds.library import pretrained_path
+    from wlplan.worlds.shipped import pretrained_path
 
     folder = pretrained_path(str(kind)) if model is None else Path(model)
     data = read_description(folder, None).get("dataset")

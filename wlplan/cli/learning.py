@@ -299,7 +299,7 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     from wlplan.dataset import open_dataset
     from wlplan.models.storage import load_model, read_description
     from wlplan.training import held_out, shares_piles
-    from wlplan.worlds.library import pretrained_path
+    from wlplan.worlds.shipped import pretrained_path
 
     folder = pretrained_path("psi_low") if model is None else Path(model)
     description = read_description(folder, kind=None)

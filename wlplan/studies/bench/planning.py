@@ -16,7 +16,7 @@ from wlplan.planning.plan import plan_loads
 from wlplan.studies.bench.setup import Item, Measured, Setup
 from wlplan.studies.bench.timing import Timing, timed
 from wlplan.types import Pile
-from wlplan.worlds.library import load_world
+from wlplan.worlds.shipped import load_world
 
 _CYCLES, _FEW_CYCLES = 3_600, 180  # that are collected, and when it has to be quick
 _PLANNED = 15  # loads of a plan

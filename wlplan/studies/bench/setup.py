@@ -22,7 +22,7 @@ from wlplan.terrain.automaton import settle, settle_dug
 from wlplan.terrain.seed_piles import SEED_PILES
 from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.types import LoadingPlan, Pile, Pose, World, action_from
-from wlplan.worlds.library import load_world
+from wlplan.worlds.shipped import load_world
 
 LOADS = 40
 """Loads of a rollout."""
