@@ -6,6 +6,7 @@ local heightmap has 36 × 36 cells; the action is `wlplan.types.action_vector` o
 
 from __future__ import annotations
 
+import abc
 from typing import Any, ClassVar, no_type_check
 
 import jax
@@ -28,7 +29,7 @@ _LEAST, _BEND = 0.001, 0.01
 
 
 @no_type_check
-class PerformanceModel(struct.PyTreeNode):
+class PerformanceModel(struct.PyTreeNode, abc.ABC):
     """A trained performance predictor ψ. A pytree: weights and normalisers are leaves.
 
     It looks at a local heightmap by its `view`: an array, which data sets store. Whoever has the
@@ -62,6 +63,7 @@ class PerformanceModel(struct.PyTreeNode):
         """
         return self.of_view(self.view(local), action)
 
+    @abc.abstractmethod
     def view(self, local: LocalHeightmap) -> Array:
         """What the model looks at of a local heightmap.
 
@@ -71,7 +73,6 @@ class PerformanceModel(struct.PyTreeNode):
         Raises:
             InputError: If the map has another number of cells, or cells of another size.
         """
-        raise NotImplementedError
 
     def of_view(self, view: Array, action: Float[Array, "4"]) -> Performance:
         """The performance from the view of the local heightmap.
@@ -100,6 +101,7 @@ class PerformanceModel(struct.PyTreeNode):
         deviation = self.outputs.span * head.of_spreads(jnp.sqrt(variances))
         return bounded_performance(normalised, self.outputs), Performance(*(deviation**2))
 
+    @abc.abstractmethod
     def head_and_features(
         self, view: Array, action: Float[Array, "4"]
     ) -> tuple[StandardisedMlp, Float[Array, " k"]]:
@@ -109,7 +111,6 @@ class PerformanceModel(struct.PyTreeNode):
             view: See `view`.
             action: Parameters of the bucket-filling controller.
         """
-        raise NotImplementedError
 
 
 def bounded_performance(normalised: Float[Array, "3"], outputs: Normaliser) -> Performance:
