@@ -15,6 +15,7 @@ import wlplan
 from wlplan.actions import squash, unsquash
 from wlplan.errors import InputError
 from wlplan.planning.job import PlanResult
+from wlplan.planning.loading import Loading
 from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.planners import Gradient, Greedy, Nominal
 from wlplan.planning.poses import distance_to_toe, pose_at, toe_of
@@ -232,6 +233,25 @@ def test_bad_requests_are_refused() -> None:
         plan_loads(wlplan.Simulator(), cone(), planner="gradient")
     with pytest.raises(InputError):
         plan_loads(bowl_world, Pile(jnp.zeros((100, 100)), 0.1))
+
+
+@pytest.mark.parametrize("planner", [GREEDY, NOMINAL, GRADIENT], ids=lambda p: type(p).__name__)
+def test_a_cost_that_is_never_finite_is_one_clear_error(planner: Any) -> None:
+    def nowhere(loading: Loading) -> jax.Array:
+        return jnp.nan * loading.performance.mass
+
+    seen: list[float | None] = []
+    with pytest.raises(InputError, match="no plan has a finite cost"):
+        plan_loads(
+            bowl_world,
+            cone(),
+            loads=2,
+            objective=nowhere,
+            planner=planner,
+            progress=lambda stage, done, total, cost: seen.append(cost),
+        )
+    assert seen
+    assert not np.isfinite(np.array(seen, float)).any()
 
 
 def test_a_plan_can_be_made_of_loading_plan_leaves() -> None:

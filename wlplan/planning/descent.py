@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float
 
@@ -14,6 +15,11 @@ from wlplan.types import PyTree
 
 Evaluate = Callable[[PyTree], tuple[Float[Array, " k"], PyTree]]
 """`evaluate(variables) -> (costs, gradients)` of K rows side by side, leaves [K, ...]."""
+
+
+def least(costs: Any) -> float:
+    """The least of some costs that are numbers; infinite if none is."""
+    return float(np.fmin.reduce(np.asarray(costs), initial=np.inf))
 
 
 class Descent(NamedTuple):

@@ -233,7 +233,23 @@ def check_has_gradient(job: Job, remedy: str) -> None:
     if said is None:
         said = _passes_reverse_mode(job)
     if not said:
-        raise InputError(f"this world has no derivative, and one is needed: {remedy}.")
+        raise InputError(f"this world has no derivative: {remedy}.")
+
+
+def can_refine(job: Job, steps: int) -> bool:
+    """Whether a planner that may refine by gradient, in so many steps, is to do so.
+
+    Args:
+        job: Any job.
+        steps: Steps that it would make; 0 for none.
+
+    Raises:
+        InputError: If the world does not say whether it has a derivative, and has none.
+    """
+    if steps == 0 or is_differentiable(job.world) is False:
+        return False
+    check_has_gradient(job, "declare that with wlplan.world(function, differentiable=False)")
+    return True
 
 
 def _passes_reverse_mode(job: Job) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from wlplan.planning.descent import Descent, begin, descend_stepwise, step
+from wlplan.planning.descent import Descent, begin, descend_stepwise, least, step
 from wlplan.planning.job import (
     Decisions,
     Job,
@@ -83,8 +83,8 @@ class Gradient:
                 found = np.flatnonzero(np.isfinite(values))
                 snapshots.extend((float(values[r]), _row(descent.variables, int(r))) for r in found)
             if progress is not None:
-                reached = min(float(descent.best_costs.min()), np.nanmin(values, initial=np.inf))
-                progress("gradient", number, self.iterations, float(reached))
+                reached = min(least(descent.best_costs), least(values))
+                progress("gradient", number, self.iterations, reached)
 
         last = descend_stepwise(
             lambda decisions: costs_and_gradients(job, decisions),

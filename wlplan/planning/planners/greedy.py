@@ -16,7 +16,7 @@ from wlplan.planning.descent import descend
 from wlplan.planning.job import (
     Decisions,
     Job,
-    check_has_gradient,
+    can_refine,
     contour_length,
     cost_of_next,
     decide,
@@ -24,7 +24,6 @@ from wlplan.planning.job import (
 )
 from wlplan.planning.proposals import Progress, Proposals
 from wlplan.types import Pile
-from wlplan.worlds.capabilities import is_differentiable
 from wlplan.xla import ParallelMap
 
 
@@ -55,9 +54,7 @@ class Greedy:
         self, job: Job, loads: int, *, seed: int, progress: Progress | None = None
     ) -> Proposals:
         """One plan, leaves [1, N]; arguments as of `Planner.propose`."""
-        refines = self.refine_steps > 0 and is_differentiable(job.world) is not False
-        if refines:
-            check_has_gradient(job, "say so by wlplan.world(function, differentiable=False)")
+        refines = can_refine(job, self.refine_steps)
         random = np.random.default_rng(seed)
         dtype = job.pile.height.dtype
         count = max(8, round(self.poses_per_metre * float(contour_length(job))))
@@ -70,19 +67,20 @@ class Greedy:
             actions = spread_actions(self.actions, random, dtype)
             costs = _candidate_costs(job, pile, poses, actions, batch=self.batch)
             # One start a pose, so that refinement does not begin in the same place eight times.
-            best_poses = np.argsort(costs.min(axis=1))[: self.refined]
+            cheapest = costs.min(axis=1)
+            best_poses = np.argsort(cheapest)[: self.refined]
             starts = Decisions(
                 position=jnp.asarray(poses[best_poses, 0]),
                 offset=jnp.asarray(poses[best_poses, 1]),
                 action=actions[costs.argmin(axis=1)[best_poses]],
             )
-            values = costs.min(axis=1)[best_poses]
+            values = cheapest[best_poses]
             if refines:
                 starts, refined = _refine(
                     job, pile, starts, steps=self.refine_steps, rate=self.refine_rate
                 )
                 values = np.asarray(refined)
-            best = int(np.nanargmin(values))
+            best = int(np.argmin(values))
             decision = jax.tree.map(lambda leaf, b=best: leaf[b], starts)
             pile = _advance(job, pile, decision)
             chosen.append(decision)
@@ -114,16 +112,18 @@ def _candidate_costs(
     *,
     batch: int,
 ) -> Float[np.ndarray, "p a"]:
-    """Cost of every action at every pose, in portions of at most `batch` of one shape.
+    """Cost of every action at every pose, infinite where it is none, in portions of one shape.
 
-    Poses are positions along the toe and heading offsets, as in `Decisions`. Their number follows
-    from the length of the toe; if that were a shape, every next pile would be compiled for.
+    Portions hold at most `batch` costs. Poses are positions along the toe and heading offsets, as
+    in `Decisions`. Their number follows from the length of the toe; if that were a shape, every
+    next pile would be compiled for.
     """
     size = max(1, batch // len(actions))
     portions = -(-len(poses) // size)
     rows = np.minimum(np.arange(portions * size), len(poses) - 1).reshape(portions, size)
-    costs = _costs_of_portions((job, pile, actions), poses[rows])
-    return np.asarray(costs).reshape(-1, len(actions))[: len(poses)]
+    found = np.asarray(_costs_of_portions((job, pile, actions), poses[rows]))
+    costs: np.ndarray = np.nan_to_num(found, nan=np.inf, posinf=np.inf)
+    return costs.reshape(-1, len(actions))[: len(poses)]
 
 
 @functools.partial(jax.jit, static_argnames=("steps", "rate"))

@@ -12,16 +12,15 @@ import optax
 from jaxtyping import Array, Float
 
 from wlplan.actions import spread_actions
-from wlplan.planning.descent import Descent, begin, descend_stepwise, step
+from wlplan.planning.descent import Descent, begin, descend_stepwise, least, step
 from wlplan.planning.job import (
     Decisions,
     Job,
-    check_has_gradient,
+    can_refine,
     costs_and_gradients,
     outcomes,
 )
 from wlplan.planning.proposals import Progress, Proposals
-from wlplan.worlds.capabilities import is_differentiable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,9 +46,7 @@ class Nominal:
         self, job: Job, loads: int, *, seed: int, progress: Progress | None = None
     ) -> Proposals:
         """One plan, leaves [1, N]; arguments as of `Planner.propose`."""
-        refines = self.refine_steps > 0 and is_differentiable(job.world) is not False
-        if refines:
-            check_has_gradient(job, "say so by wlplan.world(function, differentiable=False)")
+        refines = can_refine(job, self.refine_steps)
         batches = -(-self.actions // self.rows)
         random = np.random.default_rng(seed)
         trials = spread_actions(self.rows * batches, random, job.pile.height.dtype)
@@ -68,15 +65,15 @@ class Nominal:
             costs, _ = evaluate(trials[k * self.rows : (k + 1) * self.rows])
             tried.append(np.asarray(costs))
             if progress is not None:
-                progress("nominal", k + 1, total, float(np.nanmin(np.concatenate(tried))))
-        costs_of_trials = np.concatenate(tried)
+                progress("nominal", k + 1, total, least(np.concatenate(tried)))
+        costs_of_trials = np.nan_to_num(np.concatenate(tried), nan=np.inf, posinf=np.inf)
         order = np.argsort(costs_of_trials)
-        best, least = trials[order[0]], float(costs_of_trials[order[0]])
+        best, lowest = trials[order[0]], float(costs_of_trials[order[0]])
         if refines:
 
             def visit(number: int, costs: Array, descent: Descent) -> None:
                 if progress is not None:
-                    reached = min(least, float(np.nanmin(costs)), float(descent.best_costs.min()))
+                    reached = min(lowest, least(costs), least(descent.best_costs))
                     progress("nominal", batches + number + 1, total, reached)
 
             last = descend_stepwise(
@@ -87,7 +84,7 @@ class Nominal:
                 visit,
             )
             winner = int(np.argmin(last.best_costs))
-            if float(last.best_costs[winner]) < least:
+            if float(last.best_costs[winner]) < lowest:
                 best = last.best[winner]
         return Proposals(evenly_spread(job, loads, best[None, :]))
 
