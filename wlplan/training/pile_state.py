@@ -14,11 +14,10 @@ from wlplan.constants import CELL_SIZE, KG_PER_TONNE
 from wlplan.dataset import Dataset
 from wlplan.errors import InputError
 from wlplan.models.pile_state import PileStatePredictor
+from wlplan.site.soil import GRAVEL
 from wlplan.terrain.heightmap import STATE_DISPLACEMENT
 from wlplan.types import LocalHeightmap
 
-# Density where a data set does not name its soil [kg/m³]: gravel. Paper, table of the simulator.
-_DENSITY = 1727.0
 # Cycles predicted at a time, which bounds the memory.
 _CHUNK = 64
 
@@ -119,7 +118,9 @@ def state_tables(dataset: Dataset) -> dict[str, np.ndarray]:
 
 def action_and_volume(dataset: Dataset) -> Float[np.ndarray, "n 5"]:
     """Action, and the volume of the load at the density of the soil [m³]."""
+    # A data set that does not name its soil is of gravel, the paper's.
     soil = dataset.attributes.get("soil")
-    density = soil.get("density", _DENSITY) if isinstance(soil, dict) else _DENSITY
+    named = soil if isinstance(soil, dict) else {}
+    density = named.get("density", GRAVEL.density)
     volume = dataset.mass * np.float32(KG_PER_TONNE / density)
     return np.concatenate([dataset.action, volume[:, None]], axis=1).astype(np.float32)
