@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from wlplan.errors import InputError
+from wlplan.errors import InputError, one_line
 
 
 def is_reference(text: str) -> bool:
@@ -24,7 +24,7 @@ def load_object(reference: str) -> Any:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:
-        what = " ".join(str(error).split())[:120] or type(error).__name__
+        what = one_line(error)
         raise InputError(
             f"{reference}: {module_name} cannot be imported ({type(error).__name__}: {what}): "
             f"check the name, or put its folder on PYTHONPATH."

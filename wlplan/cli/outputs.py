@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wlplan.errors import InputError
+from wlplan.errors import InputError, one_line
 
 
 def checked_folder(name: str) -> Path:
@@ -34,9 +34,8 @@ def checked_folder(name: str) -> Path:
         probe.mkdir()
         probe.rmdir()
     except OSError as error:
-        raise InputError(
-            f"{name}: cannot be written ({error.strerror or error}): choose another folder."
-        ) from error
+        reason = one_line(error.strerror or error)
+        raise InputError(f"{name}: cannot be written ({reason}): choose another folder.") from error
     return folder
 
 

@@ -14,7 +14,7 @@ from wlplan.dataset.protocol import PROTOCOLS
 from wlplan.dataset.variables import LOADS
 from wlplan.dataset.worker_pool import CollectionSettings, collect_batches
 from wlplan.engines.simulator import Simulator
-from wlplan.errors import InputError
+from wlplan.errors import InputError, one_line
 
 _SIMULATOR = Simulator()
 
@@ -78,7 +78,7 @@ def collect(
                     done += len(batch["mass"])
                     store.update_attributes(path, {"cycles_done": done})
     except OSError as error:
-        reason = error.strerror or str(error) or type(error).__name__
+        reason = one_line(error.strerror or error)
         advice = "free some space" if error.errno == errno.ENOSPC else "choose another place"
         if done:
             advice += (

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from wlplan.dataset import store
 from wlplan.dataset.layout import Layout
 from wlplan.dataset.variables import VARIABLES
-from wlplan.errors import InputError
+from wlplan.errors import InputError, one_line
 from wlplan.io.files import atomic_folder
 from wlplan.io.provenance import command
 
@@ -84,7 +84,7 @@ def merge(
                             progress(done, whole.cycles)
                 store.update_attributes(new, complete)
     except OSError as error:
-        reason = error.strerror or str(error) or type(error).__name__
+        reason = one_line(error.strerror or error)
         advice = "free some space" if error.errno == errno.ENOSPC else "choose another place"
         raise InputError(
             f"{path}: cannot be written ({reason}): {advice}; the shards are as they were."
@@ -247,8 +247,7 @@ def _encoding(array: Path) -> dict[str, Any]:
 
 
 def _damaged(path: Path, what: object) -> InputError:
-    text = " ".join(str(what).split())[:120] or type(what).__name__
     return InputError(
-        f"{path}: is damaged or cannot be read ({text}): if it is damaged, delete it and collect "
-        f"it again."
+        f"{path}: is damaged or cannot be read ({one_line(what)}): if it is damaged, delete it and "
+        f"collect it again."
     )

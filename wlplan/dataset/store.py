@@ -19,7 +19,7 @@ import numpy as np
 from wlplan.dataset.layout import Layout
 from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, h36_after
 from wlplan.engines.simulator import Simulator
-from wlplan.errors import InputError
+from wlplan.errors import InputError, one_line
 from wlplan.io.files import atomic_folder, replace_file
 from wlplan.io.provenance import command, versions
 
@@ -310,7 +310,7 @@ def open_dataset(path: str | os.PathLike[str]) -> Dataset:
                 raise ValueError(f"{name} has shape {columns[name].shape}")
     except Exception as error:
         # Damaged chunks make the decoders raise almost anything; to the user it means the same.
-        what = " ".join(str(error).split())[:120] or type(error).__name__
+        what = one_line(error)
         raise InputError(f"{path}: is damaged ({what}): copy or collect it again.") from error
     if "h36_after" not in columns:
         # Earlier versions did not store it.

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-from wlplan.errors import InputError
+from wlplan.errors import InputError, one_line
 
 
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
@@ -30,7 +30,7 @@ def write_bytes_atomic(path: str | os.PathLike[str], content: bytes) -> None:
     try:
         replace_file(Path(path), content)
     except OSError as error:
-        reason = error.strerror or one_line(error)
+        reason = one_line(error.strerror or error)
         raise InputError(f"{path}: cannot be written ({reason}): choose another place.") from error
 
 
@@ -216,9 +216,3 @@ def named(path: Path) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{path}: {error}") from error.__cause__
-
-
-def one_line(error: object) -> str:
-    """The gist of a message: one line, at most 120 characters."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 120 else text[:117] + "..."

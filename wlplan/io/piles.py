@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from wlplan.constants import CELL_SIZE
-from wlplan.errors import InputError
+from wlplan.errors import InputError, one_line
 from wlplan.io.clouds import grid_points
-from wlplan.io.files import check_is_file, named, one_line, write_bytes_atomic
+from wlplan.io.files import check_is_file, named, write_bytes_atomic
 from wlplan.io.readers import find_reader
 from wlplan.io.scans import Heightmap, PointCloud, check_size, real_numbers
 from wlplan.terrain.floor import estimate_ground, fill_unseen

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
-from wlplan.errors import InputError
-from wlplan.io.files import check_is_file, named, one_line, write_text_atomic
+from wlplan.errors import InputError, one_line
+from wlplan.io.files import check_is_file, named, write_text_atomic
 from wlplan.types import Action, LoadingPlan, Performance, Pose
 from wlplan.xla import floats
 

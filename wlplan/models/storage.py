@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from wlplan.errors import InputError
+from wlplan.errors import InputError, one_line
 from wlplan.io.files import atomic_folder
 from wlplan.io.provenance import command, versions
 from wlplan.models.ensemble import Ensemble, members_of
@@ -142,7 +142,7 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
             text = json.dumps(description, indent=2, allow_nan=False) + "\n"
             (new / _DESCRIPTION).write_text(text, "utf-8")
     except OSError as error:
-        reason = error.strerror or type(error).__name__
+        reason = one_line(error.strerror or error)
         raise InputError(
             f"{directory}: cannot be written ({reason}): choose another place."
         ) from error
@@ -197,7 +197,7 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
                 raise ValueError(f"weights of shape {got.shape}, not {want.shape}")
     except Exception as error:
         # A damaged description makes anything fail; to the user it means the same.
-        what = " ".join(str(error).split())[:120] or type(error).__name__
+        what = one_line(error)
         raise InputError(f"{directory}: is damaged ({what}): copy or train it again.") from error
     nnx.replace_by_pure_dict(params, jax.tree.map(jnp.asarray, weights))
     model = _KINDS[kind].model(params=params, graph=graph, **normalisers)

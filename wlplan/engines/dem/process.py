@@ -28,8 +28,8 @@ from wlplan.engines.dem.cycle import CycleRecord
 from wlplan.engines.dem.grains import DemSettings
 from wlplan.engines.dem.packing import Walls
 from wlplan.engines.dem.worker import VERSION
-from wlplan.errors import InputError
-from wlplan.io.files import one_line, write_bytes_atomic
+from wlplan.errors import InputError, one_line
+from wlplan.io.files import write_bytes_atomic
 from wlplan.site.machine import WheelLoader
 from wlplan.site.soil import Soil
 
@@ -71,7 +71,7 @@ def cache_folder() -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        reason = error.strerror or one_line(error)
+        reason = one_line(error.strerror or error)
         raise InputError(
             f"{folder}: the cache cannot be made ({reason}): set {CACHE} to another folder."
         ) from error
@@ -190,7 +190,7 @@ def run_job(
                 f"give it an idle core, or more time by `DemSettings(timeout=...)`."
             ) from error
         except OSError as error:
-            reason = error.strerror or one_line(error)
+            reason = one_line(error.strerror or error)
             raise InputError(
                 f"{words[0]}: cannot be started ({reason}): check {INTERPRETER}."
             ) from error

@@ -28,8 +28,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from wlplan.errors import InputError
-from wlplan.io.files import one_line
+from wlplan.errors import InputError, one_line
 from wlplan.io.scans import Scan
 
 ENTRY_POINTS = "wlplan.readers"
