@@ -1,9 +1,22 @@
 """Test set-up: shapes are checked at run time, and what JAX would forgive is an error."""
 
 import os
+from pathlib import Path
 
-# Two workers share two cores; XLA reads this when JAX is imported.
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+# Compiling takes most of the time: a program is compiled once for all tests, both workers and the
+# processes that they start. JAX locks the folder, and removes what was not used for longest.
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "xla")
+)
+os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(2**30))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+# Two workers share two cores; and programs that run for moments are not worth XLA's last effort.
+# `make demo`, `make test-lowest` and `make test-newest` have XLA as it is by default.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=1 "
+    "--xla_cpu_use_fusion_emitters=false",
+)
 
 import jax
 import jaxtyping

@@ -9,9 +9,12 @@ import pytest
 from jax.typing import ArrayLike, DTypeLike
 from laws import assert_gradient
 
-from wlplan.terrain.characteristics import as_vector, characteristics
+from wlplan.terrain.characteristics import as_vector
+from wlplan.terrain.characteristics import characteristics as uncompiled
 from wlplan.terrain.heightmap import local_axes
 from wlplan.types import LocalHeightmap
+
+characteristics = jax.jit(uncompiled)
 
 
 def local(height: ArrayLike, dtype: DTypeLike = jnp.float32) -> LocalHeightmap:
@@ -69,8 +72,7 @@ def test_the_gradient_agrees_with_finite_differences() -> None:
 
 @pytest.mark.parametrize("height", [np.zeros((36, 36)), np.full((36, 36), 1.5), 0.5 * grid()[0]])
 def test_flat_and_head_on_ground_have_finite_values_and_gradients(height: np.ndarray) -> None:
-    jacobian = jax.jacrev(lambda h: as_vector(characteristics(local(h))))(
-        jnp.asarray(height, jnp.float32)
-    )
+    slopes = jax.jit(jax.jacrev(lambda h: as_vector(characteristics(local(h)))))
+    jacobian = slopes(jnp.asarray(height, jnp.float32))
     assert jnp.isfinite(jacobian).all()
     assert jnp.abs(jacobian).max() < 200.0

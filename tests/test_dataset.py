@@ -294,6 +294,7 @@ def test_another_seed_gives_other_cycles_and_a_longer_collection_begins_alike() 
     assert headings.std() == pytest.approx(math.radians(20.0) / math.sqrt(12.0), rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_corridor_is_dug_on_where_it_was_dug_before(worker: WorkerProcess) -> None:
     def nearest(protocol: str) -> tuple[float, list[np.ndarray]]:
         """Median distance of a loading from the nearest before it."""
@@ -355,6 +356,7 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(
     assert len(steps) > 1000
 
 
+@pytest.mark.slow
 def test_up_to_the_first_slow_loading_the_protocol_is_the_papers(worker: WorkerProcess) -> None:
     def episodes(protocol: str) -> list[FinishedEpisode]:
         finished: list[FinishedEpisode | None] = []

@@ -29,7 +29,15 @@ from wlplan.training import (
     held_out,
     train,
 )
-from wlplan.types import LoadingPlan, LocalHeightmap, Performance, Pile, Pose, action_from
+from wlplan.types import (
+    LoadingPlan,
+    LocalHeightmap,
+    Performance,
+    Pile,
+    Pose,
+    Rollout,
+    action_from,
+)
 from wlplan.worlds.learned import LearnedWorld
 
 MEMBERS = 5
@@ -92,6 +100,17 @@ def flat(performance: Performance) -> jax.Array:
     return jnp.stack([performance.mass, performance.time, performance.work])
 
 
+@jax.jit
+def of_view(model: Any, view: jax.Array) -> jax.Array:
+    return flat(model.of_view(view, ACTION))
+
+
+@jax.jit
+def with_deviation(model: Ensemble, view: jax.Array, action: jax.Array = ACTION) -> jax.Array:
+    """Mean and deviation, shape [2, 3]."""
+    return jnp.stack([flat(p) for p in model.of_view_with_deviation(view, action)])
+
+
 def test_nine_in_ten_held_out_cycles_lie_inside_the_interval(
     saved: tuple[Path, Ensemble, EvaluationReport],
 ) -> None:
@@ -110,8 +129,8 @@ def test_the_deviation_is_that_of_the_data_where_they_scatter_much_and_where_lit
     model = saved[1]
     view = jnp.array([0.4, 0.5, 0.0, 0.0])
     for slope in (0.25, 0.55):
-        _, deviation = model.of_view_with_deviation(view.at[0].set(slope), ACTION)
-        assert float(deviation.mass) == pytest.approx(scatter(slope), rel=0.35)
+        _, deviation = with_deviation(model, view.at[0].set(slope))
+        assert float(deviation[0]) == pytest.approx(scatter(slope), rel=0.35)
 
 
 def test_the_check_of_the_interval_can_fail(
@@ -132,14 +151,14 @@ def test_an_ensemble_is_the_mean_of_its_members_which_differ(
     told = []
     for k in range(model.size):
         params = jax.tree.map(lambda leaf, k=k: leaf[k], model.members.params)
-        told.append(flat(model.members.replace(params=params).of_view(view, ACTION)))
+        told.append(of_view(model.members.replace(params=params), view))
     each = np.stack(told)
     assert len(each) == MEMBERS
     assert (each.std(axis=0) > 1e-4).all()
-    np.testing.assert_allclose(flat(model.of_view(view, ACTION)), each.mean(axis=0), rtol=1e-5)
-    mean, deviation = model.of_view_with_deviation(view, ACTION)
-    np.testing.assert_allclose(flat(mean), each.mean(axis=0), rtol=1e-5)
-    assert (flat(deviation) > model.factor * each.std(axis=0)).all()
+    np.testing.assert_allclose(of_view(model, view), each.mean(axis=0), rtol=1e-5)
+    mean, deviation = with_deviation(model, view)
+    np.testing.assert_allclose(mean, each.mean(axis=0), rtol=1e-5)
+    assert (deviation > model.factor * each.std(axis=0)).all()
 
 
 def test_it_errs_less_than_a_member_alone(
@@ -160,11 +179,9 @@ def test_the_gradient_of_mean_and_deviation_is_finite_also_far_from_the_data(
     saved: tuple[Path, Ensemble, EvaluationReport],
 ) -> None:
     model = saved[1]
+    jacobian = jax.jit(jax.jacrev(lambda v, a: with_deviation(model, v, a), (0, 1)))
     for view in (jnp.zeros(4), jnp.array([0.4, 0.5, 0.0, 0.1]), jnp.full(4, 1e4)):
-        slopes = jax.jacrev(
-            lambda v, a: jnp.stack([flat(p) for p in model.of_view_with_deviation(v, a)]), (0, 1)
-        )(view, ACTION)
-        assert all(np.isfinite(slope).all() for slope in slopes)
+        assert all(np.isfinite(slope).all() for slope in jacobian(view, ACTION))
 
 
 def test_an_ensemble_comes_back_bit_by_bit(saved: tuple[Path, Ensemble, EvaluationReport]) -> None:
@@ -224,19 +241,25 @@ def site() -> tuple[Pile, Pose]:
     return pile, edge_poses(toe_contour(pile), 2)
 
 
+@pytest.mark.slow
 def test_a_world_of_an_ensemble_is_a_world_like_any_other(
     saved: tuple[Path, Ensemble, EvaluationReport], site: tuple[Pile, Pose]
 ) -> None:
     pile, poses = site
     world = LearnedWorld(saved[1])
     plan = LoadingPlan(poses, action_from(jnp.tile(ACTION, (2, 1))))
-    outcome = jax.jit(wlplan.rollout)(world, pile, plan)
+
+    def work(plan: LoadingPlan) -> tuple[jax.Array, Rollout]:
+        outcome = wlplan.rollout(world, pile, plan)
+        return outcome.performance.work.sum(), outcome
+
+    (_, outcome), slope = jax.jit(jax.value_and_grad(work, has_aux=True))(plan)
     lost = np.asarray(pile.height - outcome.pile.height, np.float64).sum() * pile.cell_size**2
     assert lost * 1.727 == pytest.approx(float(outcome.performance.mass.sum()), rel=1e-3)
-    slope = jax.grad(lambda plan: wlplan.rollout(world, pile, plan).performance.work.sum())(plan)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
 
 
+@pytest.mark.slow
 def test_a_world_predicts_the_deviation_of_its_error(
     saved: tuple[Path, Ensemble, EvaluationReport], data: Dataset, site: tuple[Pile, Pose]
 ) -> None:
@@ -245,14 +268,13 @@ def test_a_world_predicts_the_deviation_of_its_error(
     high, _ = train(PsiHighSettings(**(LIGHT | {"epochs": 2, "members": 2})), data)
     for world in (LearnedWorld(saved[1]), LearnedWorld(high)):
 
-        @jax.jit
         def deviation_of(
             heading: jax.Array, world: LearnedWorld = world
         ) -> tuple[jax.Array, Performance]:
             found = world.uncertainty(pile, pose.replace(heading=heading), action_from(ACTION))
             return found.mass, found
 
-        slope, found = jax.grad(deviation_of, has_aux=True)(pose.heading)
+        slope, found = jax.jit(jax.grad(deviation_of, has_aux=True))(pose.heading)
         assert (flat(found) > 0.0).all()
         assert np.isfinite(slope)
     deviation = high.with_deviation(LocalHeightmap(jnp.zeros((36, 36)), 0.1, 0.0), ACTION)[1]

@@ -54,6 +54,7 @@ def test_a_performance_predictor_stands_beside_the_papers(
     assert "0.31 ms" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_ensemble_is_timed_with_and_without_its_deviation(
     data: Dataset, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -65,6 +66,7 @@ def test_an_ensemble_is_timed_with_and_without_its_deviation(
     assert capsys.readouterr().out.count("with the deviation") == 2
 
 
+@pytest.mark.slow
 def test_the_papers_pile_state_model_is_judged_with_and_without_post_processing(
     data: Dataset,
 ) -> None:

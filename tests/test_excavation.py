@@ -9,11 +9,13 @@ import pytest
 from jax.typing import DTypeLike
 from laws import assert_gradient
 
-from wlplan.terrain.excavation import STRIP_LENGTH, excavate
+from wlplan.terrain import excavation
+from wlplan.terrain.excavation import STRIP_LENGTH
 from wlplan.terrain.heightmap import cell_centres, to_local
 from wlplan.types import Pile, Pose
 
 WIDTH = 2.7
+excavate = jax.jit(excavation.excavate, static_argnames="width")
 
 
 def slope_pile(dtype: DTypeLike = jnp.float32, degrees: float = 30.0) -> Pile:

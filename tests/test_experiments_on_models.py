@@ -29,6 +29,7 @@ def breaks(*_: object, **__: object) -> None:
     raise ZeroDivisionError
 
 
+@pytest.mark.slow
 def test_a_model_is_trained_once_and_found_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -52,6 +53,7 @@ def test_a_model_is_trained_once_and_found_again(
     assert sum(fingerprint(data)[7:15] in name for name in names) == 2
 
 
+@pytest.mark.slow
 def test_another_default_is_another_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = synthetic(rollouts=10, loads=6)
 

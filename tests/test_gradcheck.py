@@ -259,6 +259,7 @@ def command(
     return run
 
 
+@pytest.mark.slow
 def test_the_command_passes_the_world_that_ships(
     command: Callable[..., tuple[int, str, str]], tmp_path: Path
 ) -> None:

@@ -9,16 +9,12 @@ import pytest
 from jax.typing import DTypeLike
 from laws import assert_gradient
 
-from wlplan.terrain.heightmap import (
-    add_local_change,
-    local_axes,
-    sample,
-    sample_local,
-    take,
-    to_local,
-    to_world,
-)
+from wlplan.terrain import heightmap
+from wlplan.terrain.heightmap import local_axes, sample, take, to_local, to_world
 from wlplan.types import Pile, Pose
+
+add_local_change = jax.jit(heightmap.add_local_change, static_argnums=4)
+sample_local = jax.jit(heightmap.sample_local, static_argnames=("cells", "displacement"))
 
 
 def plane(

@@ -82,7 +82,13 @@ def test_all_weights_together_are_small() -> None:
     assert not [path for path in files if path.suffix in (".pkl", ".pickle")]
 
 
-@pytest.mark.parametrize("name", LEARNED)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "hybrid",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in LEARNED if name != "hybrid"),
+    ],
+)
 def test_every_learned_world_is_there_and_loads_a_bucket(name: str) -> None:
     world = load_world(name)
     assert isinstance(world, LearnedWorld)

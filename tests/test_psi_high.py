@@ -1,5 +1,6 @@
 """Laws of ψ_high: encoders, finite gradients on flat ground, training, its worlds."""
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
+from precision import in_float64
 from trainings import check_that_a_killed_one_ends_alike
 
 from wlplan.dataset import VARIABLES, Dataset
@@ -31,15 +33,19 @@ OUT = np.array([[0.1, 6.0, 110.0], [4.8, 21.0, 1390.0]], np.float32)
 ACTION = jnp.array([0.3, 2.0, 0.2, 3.0])
 
 
-def model_of(
-    encoder: str = "principal", activation: str = "swish", seed: int = 0
-) -> HighPerformanceModel:
-    network = PsiHigh((32, 32), encoder=encoder, activation=activation, rngs=nnx.Rngs(seed))
+@functools.cache
+def model_of(encoder: str = "principal", activation: str = "swish") -> HighPerformanceModel:
     maps = jnp.stack([surface(k, 0.2 + 0.05 * k) for k in range(8)])
     random = np.random.default_rng(0)
     inputs, outputs = (jnp.asarray(random.uniform(size=(8, n)), jnp.float32) for n in (8, 3))
-    network.fit_scales(maps, inputs, outputs)
-    graph, params = nnx.split(network)
+
+    @nnx.jit
+    def network() -> PsiHigh:
+        made = PsiHigh((32, 32), encoder=encoder, activation=activation, rngs=nnx.Rngs(0))
+        made.fit_scales(maps, inputs, outputs)
+        return made
+
+    graph, params = nnx.split(network())
     ranges = {
         "maps": np.array([[-0.2], [2.7]], np.float32),
         "inputs": np.stack([LOW, HIGH]),
@@ -55,6 +61,7 @@ def surface(seed: int = 0, slope: float = 0.6) -> jax.Array:
     return jnp.asarray((slope * x[:, None] + rough).astype(np.float32))
 
 
+@jax.jit
 def performance(
     model: HighPerformanceModel, height: jax.Array, action: jax.Array = ACTION
 ) -> jax.Array:
@@ -125,27 +132,33 @@ def test_a_batch_equals_its_members(encoder: str) -> None:
 
 
 def test_norms_follow_the_batch_in_training_alone() -> None:
-    network = PsiHigh((8,), rngs=nnx.Rngs(0))
+    network = nnx.jit(lambda: PsiHigh((8,), rngs=nnx.Rngs(0)))()
     maps, inputs = jnp.stack([surface(0), surface(1)]), jnp.full((2, 8), 0.5)
     before = jax.tree.leaves(nnx.state(network, nnx.BatchStat))
-    network(maps, inputs)
+    nnx.jit(lambda n: n(maps, inputs))(network)
     same = jax.tree.leaves(nnx.state(network, nnx.BatchStat))
     assert all(np.array_equal(a, b) for a, b in zip(before, same, strict=True))
-    network(maps, inputs, rngs=nnx.Rngs(0))
+    nnx.jit(lambda n: n(maps, inputs, rngs=nnx.Rngs(0)))(network)
     after = jax.tree.leaves(nnx.state(network, nnx.BatchStat))
     assert not all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
 
 
-@pytest.mark.parametrize("encoder", ENCODERS)
-@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize(
+    ("encoder", "activation"),
+    [
+        ("principal", "swish"),
+        ("convolutional", "swish"),
+        pytest.param("principal", "leaky_relu", marks=pytest.mark.slow),
+        pytest.param("convolutional", "leaky_relu", marks=pytest.mark.slow),
+    ],
+)
 def test_the_gradient_is_finite_on_flat_ground_and_finds_the_action(
     encoder: str, activation: str
 ) -> None:
     model = model_of(encoder, activation)
+    jacobian = jax.jit(jax.jacrev(lambda h, a: performance(model, h, a), (0, 1)))
     for height in (jnp.zeros((36, 36)), jnp.full((36, 36), 1e6), surface()):
-        by_height, by_action = jax.jacrev(lambda h, a: performance(model, h, a), (0, 1))(
-            height, ACTION
-        )
+        by_height, by_action = jacobian(height, ACTION)
         assert np.isfinite(by_height).all()
         assert np.isfinite(by_action).all()
     assert np.abs(by_height).max() > 0.0
@@ -154,8 +167,9 @@ def test_the_gradient_is_finite_on_flat_ground_and_finds_the_action(
 
 @pytest.mark.parametrize("encoder", ENCODERS)
 def test_the_gradient_agrees_with_finite_differences(encoder: str) -> None:
+    single = model_of(encoder)
     with jax.enable_x64(True):
-        model = model_of(encoder)
+        model = in_float64(single)
         height = jnp.asarray(surface(), jnp.float64)
         along = jnp.asarray(np.random.default_rng(3).normal(0.0, 0.1, (36, 36)))
 
@@ -225,7 +239,9 @@ def test_training_reads_the_map_and_a_model_comes_back_bit_by_bit(tmp_path: Path
     assert float(lost * GRAVEL.density / 1000.0) == pytest.approx(float(p.mass), rel=1e-3)
 
 
-@pytest.mark.parametrize("encoder", ENCODERS)
+@pytest.mark.parametrize(
+    "encoder", ["principal", pytest.param("convolutional", marks=pytest.mark.slow)]
+)
 def test_a_killed_training_ends_with_the_same_weights(
     encoder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,7 +27,7 @@ OUT_HIGH = np.array([4.8, 19.5, 1300.0], np.float32)
 def model_of(
     seed: int = 0, hidden: tuple[int, ...] = (32, 32), **settings: Any
 ) -> LowPerformanceModel:
-    graph, params = nnx.split(PsiLow(hidden, rngs=nnx.Rngs(seed), **settings))
+    graph, params = nnx.split(nnx.jit(lambda: PsiLow(hidden, rngs=nnx.Rngs(seed), **settings))())
     # Large output weights, so that the untrained network asks for negative loads too.
     output: Any = params["output"]
     output["kernel"][...] = 20.0 * output["kernel"][...]
@@ -191,4 +191,5 @@ def test_the_soft_clamp_is_the_identity_inside_and_smooth_at_the_border() -> Non
     slope = jax.vmap(jax.grad(lambda v: soft_clamp(v[None])[0]))(points)
     np.testing.assert_allclose(slope, 1.0, atol=1e-4)
     values = soft_clamp(jnp.linspace(-2.0, 3.0, 400))
-    assert np.all(np.diff(values) >= 0.0)
+    # But for rounding: how XLA's exponential rounds depends on how it is compiled.
+    assert np.all(np.diff(values) >= -np.finfo(np.float32).eps)

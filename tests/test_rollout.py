@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jax.typing import ArrayLike, DTypeLike
 from laws import assert_gradient, volume
+from precision import in_float64
 
 import wlplan
 from wlplan.engines.simulator import Simulator
@@ -185,14 +186,6 @@ def roll() -> Callable[..., Rollout]:
     return jax.jit(lambda world, pile, plan: rollout(world, pile, plan))
 
 
-def in_float64(tree: Any) -> Any:
-    def widen(leaf: Any) -> Any:
-        is_float = jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
-        return jnp.asarray(np.asarray(leaf), jnp.float64) if is_float else leaf
-
-    return jax.tree.map(widen, tree)
-
-
 def lost_mass(before: Pile, after: Pile) -> float:
     heights = (np.asarray(p.height, np.float64).sum() for p in (before, after))
     first, last = heights
@@ -267,6 +260,8 @@ def gradient_of_one(low: World) -> Callable[..., Any]:
     return run
 
 
+# Slow, for what it takes to compile; on a smaller grid the same is tested below for any plan.
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["on the pile", "off the pile", "off the grid", "flat", "hollow"])
 def test_gradients_are_finite_everywhere(
     case: str, cone: tuple[Pile, np.ndarray], gradient_of_one: Callable[..., Any]

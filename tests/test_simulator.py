@@ -16,7 +16,7 @@ from scipy import ndimage, stats
 from experiments.dem_reference import REFERENCE, replay
 from wlplan.constants import ACTION_HIGH, GRAVITY
 from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig, terrain
-from wlplan.engines.simulator.cycle import Cycle, advance, begin, outcome
+from wlplan.engines.simulator.cycle import Cycle, State, advance, begin, outcome
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, Soil
 from wlplan.terrain.automaton import FLOW_FRACTION, relax, steepest_slope, sweep
@@ -354,6 +354,7 @@ def test_the_local_surface_stays_above_the_ground(digs: Digs) -> None:
     assert cycle.height.min() >= -1e-5
 
 
+@pytest.mark.slow
 def test_a_smaller_time_step_changes_little(digs: Digs) -> None:
     rng = np.random.default_rng(4)
     surfaces, actions = [bumpy(k) for k in range(24)], random_actions(rng, 24)
@@ -442,6 +443,9 @@ def test_a_sum_by_halves_is_the_sum(count: int) -> None:
     np.testing.assert_allclose(terrain.total(jnp.asarray(values)), values.sum(0), atol=1e-5)
 
 
+reaction = jax.jit(terrain.reaction, static_argnums=(0, 1))
+
+
 def met_by(
     height: np.ndarray,
     x: float = 2.0,
@@ -456,7 +460,7 @@ def met_by(
     fills = jnp.full((terrain.Lanes(WA320).count, 1), fill)
     bucket = terrain.Bucket(*(jnp.asarray([v]) for v in (x, z, tilt)))
     floor = jnp.full_like(rim, ground)
-    return terrain.reaction(WA320, soil, rim, floor, fills, bucket, jnp.asarray(True))
+    return reaction(WA320, soil, rim, floor, fills, bucket, jnp.asarray(True))
 
 
 def test_a_level_floor_rests_on_the_soil_it_has_cut() -> None:
@@ -545,11 +549,14 @@ def test_cycles_advanced_in_parts_end_alike(digs: Digs) -> None:
     height = jnp.asarray(np.stack([bumpy(k) for k in range(8)], axis=-1))
     action = action_from(jnp.asarray(random_actions(rng, 8)))
     state = begin(height, jnp.zeros_like(height), action, WA320)
-    options: dict[str, Any] = {"machine": WA320, "soil": GRAVEL, "settings": Settings()}
-    part, whole = (jax.jit(partial(advance, **options, steps=n)) for n in (7, 2000))
-    once = whole(state)
+
+    @jax.jit
+    def run(state: State, steps: jax.Array) -> State:
+        return advance(state, machine=WA320, soil=GRAVEL, settings=Settings(), steps=steps)
+
+    once = run(state, jnp.asarray(2000))
     while not state.has_ended.all():
-        state = part(state)
+        state = run(state, jnp.asarray(7))
     for one, other in zip(*map(jax.tree.leaves, (state, once)), strict=True):
         np.testing.assert_array_equal(one, other)
     mass = outcome(state, machine=WA320, soil=GRAVEL).mass

@@ -1,7 +1,6 @@
 """Worlds: every predictor with every pile state, what they say they can, how their solves end."""
 
 import dataclasses
-import itertools
 from typing import Any
 
 import jax
@@ -42,7 +41,15 @@ def removed(before: Pile, after: Pile) -> float:
 
 
 @pytest.mark.parametrize(
-    ("psi", "phi"), list(itertools.product(["psi_low", "psi_high"], [None, "phi"])), ids=str
+    ("psi", "phi"),
+    [
+        # The three others are the worlds that ship under a name.
+        ("psi_low", "phi"),
+        pytest.param("psi_low", None, marks=pytest.mark.slow),
+        pytest.param("psi_high", None, marks=pytest.mark.slow),
+        pytest.param("psi_high", "phi", marks=pytest.mark.slow),
+    ],
+    ids=str,
 )
 def test_every_predictor_goes_with_every_pile_state(
     scene: Scene, psi: str, phi: str | None
@@ -133,7 +140,14 @@ def test_worlds_say_whether_they_have_an_uncertainty(scene: Scene) -> None:
     assert not wlplan.LearnedWorld(one).has_uncertainty
 
 
-@pytest.mark.parametrize("name", ["low", "high", "simulator"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "low",
+        pytest.param("high", marks=pytest.mark.slow),
+        pytest.param("simulator", marks=pytest.mark.slow),
+    ],
+)
 def test_a_solve_is_a_call_that_says_how_it_ended(scene: Scene, name: str) -> None:
     world: Any = load_world(name)
     after, performance, report = world.solve(*scene)

@@ -164,7 +164,12 @@ def begin(
 
 
 def advance(
-    state: State, *, machine: WheelLoader, soil: Soil, settings: Settings, steps: int
+    state: State,
+    *,
+    machine: WheelLoader,
+    soil: Soil,
+    settings: Settings,
+    steps: int | Int[Array, ""],
 ) -> State:
     """At most `steps` time steps; it stops early when all cycles have ended."""
 

@@ -145,6 +145,8 @@ def _relaxed(pile: Pile, repose_angle: float, tolerance: float) -> Settled:
 _MOST_ROUNDS = 200
 
 
+# Compiled once, also where a pile is settled outside of `jit`.
+@functools.partial(jax.jit, static_argnames=("repose_angle", "schedule"))
 def _settled(
     pile: Pile, dug: Array, start: Array, repose_angle: float, schedule: Schedule
 ) -> Settled:
