@@ -1,6 +1,7 @@
 """Removing a load from the strip."""
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,9 @@ from wlplan.terrain.heightmap import cell_centres, to_local
 from wlplan.types import Pile, Pose
 
 WIDTH = 2.7
-excavate = jax.jit(excavation.excavate, static_argnames="width")
+excavate: Callable[..., excavation.Excavation] = jax.jit(
+    excavation.excavate, static_argnames="width"
+)
 
 
 def slope_pile(dtype: DTypeLike = jnp.float32, degrees: float = 30.0) -> Pile:

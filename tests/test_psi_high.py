@@ -174,7 +174,8 @@ def test_the_gradient_agrees_with_finite_differences(encoder: str) -> None:
         along = jnp.asarray(np.random.default_rng(3).normal(0.0, 0.1, (36, 36)))
 
         def mass(t: jax.Array) -> jax.Array:
-            return performance(model, height + t * along, ACTION.astype(jnp.float64))[0]
+            found: jax.Array = performance(model, height + t * along, ACTION.astype(jnp.float64))
+            return found[0]
 
         slope = jax.grad(mass)(jnp.asarray(0.0))
         step = 1e-6

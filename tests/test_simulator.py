@@ -442,7 +442,7 @@ def test_a_sum_by_halves_is_the_sum(count: int) -> None:
     np.testing.assert_allclose(terrain.total(jnp.asarray(values)), values.sum(0), atol=1e-5)
 
 
-reaction = jax.jit(terrain.reaction, static_argnums=(0, 1))
+reaction: Callable[..., terrain.Reaction] = jax.jit(terrain.reaction, static_argnums=(0, 1))
 
 
 def met_by(

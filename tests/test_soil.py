@@ -77,7 +77,7 @@ def earthmoving_force(
     return least_resistance(wedge, soil=soil)
 
 
-run = jax.jit(earthmoving_force, static_argnames=("soil", "surcharge"))
+run: Callable[..., jax.Array] = jax.jit(earthmoving_force, static_argnames=("soil", "surcharge"))
 
 
 def forces(cuts: Sequence[np.ndarray], soil: Soil, surcharge: float = 0.0) -> np.ndarray:

@@ -53,7 +53,9 @@ def settle(
         round and what a single round leaves. Under `vmap` every member makes its own number of
         rounds on the CPU, one after the other; on other devices all make as many as the slowest.
     """
-    return _settled(pile, pile.height, jnp.zeros(2, jnp.int32), repose_angle, schedule)
+    corner = jnp.zeros(2, jnp.int32)
+    settled: Settled = _settled(pile, pile.height, corner, repose_angle, schedule)
+    return settled
 
 
 def settle_dug(
@@ -80,7 +82,8 @@ def settle_dug(
     Returns:
         The pile afterwards and how it ended, see `settle`.
     """
-    return _settled(pile, dug, jnp.stack(start), repose_angle, schedule)
+    settled: Settled = _settled(pile, dug, jnp.stack(start), repose_angle, schedule)
+    return settled
 
 
 @overload
