@@ -40,9 +40,8 @@ class _InOrder(click.Group):
 def wlplan(context: click.Context) -> None:
     """Plan the bucket loads of a wheel loader from a scan of the pile.
 
-    PILE is a heightmap (.npz, GeoTIFF) or a point cloud (.las, .laz, .ply) in metres. The word
-    `bundled` stands for the pile that ships with the package. It is the default where PILE may be
-    left out.
+    PILE is a heightmap (.npz, GeoTIFF) or a point cloud (.las, .laz, .ply). The word `bundled`
+    stands for the pile that ships with the package. It is the default where PILE may be left out.
     """
     if context.invoked_subcommand is None:
         click.echo(context.get_help())

@@ -16,6 +16,7 @@ from wlplan.cli.inputs import (
     world_named,
 )
 from wlplan.cli.options import (
+    PileFile,
     loads_option,
     model_options,
     objective_option,
@@ -43,7 +44,7 @@ _VERDICTS = {"ok": ("ok", None), "kink": ("kink", "yellow"), "wrong": ("WRONG", 
     short_help="Compare the gradient of a plan's cost with finite differences.",
     epilog="\b\nExample: wlplan gradcheck scan.tif --world low --loads 5",
 )
-@pile_argument
+@pile_argument()
 @with_options(
     loads_option(
         default=5,
@@ -71,7 +72,7 @@ _VERDICTS = {"ok": ("ok", None), "kink": ("kink", "yellow"), "wrong": ("WRONG", 
     out_option,
 )
 def gradcheck(
-    pile_file: str,
+    pile_file: PileFile,
     loads: int,
     world_name: str,
     objective: str,
@@ -91,7 +92,7 @@ def gradcheck(
     A component where the cost has a kink is reported as such. Ends with exit code 1 if a component
     is wrong. With --out: gradcheck.json.
     """
-    check_pile_name(pile_file)
+    check_pile_name(pile_file.name)
     check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
     in_simulator = world_name == "simulator"

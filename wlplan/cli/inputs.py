@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wlplan.cli.options import BUNDLED
+from wlplan.cli.options import BUNDLED, PileFile
 from wlplan.cli.outputs import remark
 from wlplan.errors import InputError
 from wlplan.planning import planners
@@ -123,21 +123,25 @@ def check_is_folder(name: str, what: str, maker: str) -> None:
         raise InputError(f"{name}: is a file: a {what} is a folder, made with `{maker}`.")
 
 
-def pile_named(name: str, machine: WheelLoader) -> tuple[Pile, ToeContour, dict[str, Any]]:
-    """A pile, its toe, and what plan.json says about it.
+def pile_named(file: PileFile, machine: WheelLoader) -> tuple[Pile, ToeContour, dict[str, Any]]:
+    """A pile, its toe, and what plan.json says about it; notes on the file go to stderr.
 
     Args:
-        name: Path of the pile file, or `BUNDLED`.
+        file: The pile file and how it is read.
         machine: What digs.
 
     Raises:
         InputError: If it cannot be read or dug.
     """
-    from wlplan.io import bundled_pile_path, read_pile
+    from wlplan.io import bundled_pile_path, read_scan
     from wlplan.terrain.toe import toe_contour
 
+    name = file.name
     path = bundled_pile_path() if name == BUNDLED else Path(name)
-    pile = read_pile(path)
+    scan = read_scan(path, **file.reading)
+    for note in scan.notes:
+        remark(note)
+    pile = scan.pile
     contour = toe_contour(pile, machine=machine)
     fields = {
         "file": f"{BUNDLED} ({path.name})" if name == BUNDLED else name,
@@ -145,6 +149,9 @@ def pile_named(name: str, machine: WheelLoader) -> tuple[Pile, ToeContour, dict[
         "cells": list(pile.height.shape),
         "cell_size": pile.cell_size,
         "origin": [float(value) for value in pile.origin],
+        "crs": scan.crs,
+        "notes": list(scan.notes),
+        **file.reading,
     }
     return pile, contour, fields
 

@@ -17,6 +17,7 @@ from wlplan.cli.inputs import (
 )
 from wlplan.cli.options import (
     ActionNumbers,
+    PileFile,
     model_options,
     out_option,
     pile_argument,
@@ -42,7 +43,7 @@ _MOST_LOCATIONS = 10_000
     short_help="Map what one action would yield all around a pile.",
     epilog="\b\nExample: wlplan diggability scan.tif --locations 150 --out map/",
 )
-@pile_argument
+@pile_argument()
 @with_options(
     click.option(
         "--locations",
@@ -64,7 +65,7 @@ _MOST_LOCATIONS = 10_000
     out_option,
 )
 def diggability(
-    pile_file: str,
+    pile_file: PileFile,
     locations: int,
     action: tuple[float, ...],
     world_name: str,
@@ -80,7 +81,7 @@ def diggability(
 
     With --out: diggability.png and diggability.json. Nothing is random, so --seed changes nothing.
     """
-    check_pile_name(pile_file)
+    check_pile_name(pile_file.name)
     check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
     folder = None if out is None else checked_folder(out)

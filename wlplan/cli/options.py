@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -300,7 +301,53 @@ def site_options(default: str = "") -> tuple[Callable[[Any], Any], Callable[[Any
     )
 
 
-pile_argument = click.argument("pile_file", metavar="[PILE]", default=BUNDLED)
+@dataclasses.dataclass(frozen=True)
+class PileFile:
+    """The pile file of a command.
+
+    Attributes:
+        name: Path of the file, or `BUNDLED`.
+        reading: Arguments of `wlplan.io.read_scan` that were given.
+    """
+
+    name: str
+    reading: dict[str, Any]
+
+
+_READING = (
+    click.option(
+        "--band",
+        type=click.IntRange(1, 65_535),
+        default=None,
+        help="Band of a GeoTIFF that holds the heights. Default: the only one that can.",
+    ),
+)
+
+
+def pile_argument(*, required: bool = False) -> Callable[[Any], Any]:
+    """A decorator: the argument PILE and the options of how it is read, as one `PileFile`.
+
+    Args:
+        required: Whether the pile has to be named; otherwise it is by default the bundled one.
+    """
+
+    def decorate(command: Any) -> Any:
+        @functools.wraps(command)
+        def gathered(*, pile_file: str, band: int | None, **others: Any) -> Any:
+            given = {"band": band}
+            reading = {name: value for name, value in given.items() if value is not None}
+            return command(pile_file=PileFile(pile_file, reading), **others)
+
+        found: Any = gathered
+        for option in reversed(_READING):
+            found = option(found)
+        if required:
+            return click.argument("pile_file", metavar="PILE")(found)
+        return click.argument("pile_file", metavar="[PILE]", default=BUNDLED)(found)
+
+    return decorate
+
+
 world_option = click.option(
     "--world",
     "world_name",

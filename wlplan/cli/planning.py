@@ -21,6 +21,7 @@ from wlplan.cli.inputs import (
     world_named,
 )
 from wlplan.cli.options import (
+    PileFile,
     engine_option,
     loads_option,
     model_options,
@@ -51,7 +52,7 @@ _ORIGIN_FIELDS = ("world", "model", "pile_state", "planner", "seed")
     short_help="Plan the next loads from a pile.",
     epilog="\b\nExample: wlplan plan scan.tif --loads 10 --truck 12,3,90 --out plan/",
 )
-@pile_argument
+@pile_argument()
 @with_options(
     loads_option(default=15, most=_MOST_LOADS),
     world_option,
@@ -69,7 +70,7 @@ _ORIGIN_FIELDS = ("world", "model", "pile_state", "planner", "seed")
     out_option,
 )
 def plan(
-    pile_file: str,
+    pile_file: PileFile,
     loads: int,
     world_name: str,
     planner: str,
@@ -88,7 +89,7 @@ def plan(
 
     With --out: plan.json, plan.png, totals.png and report.html, which shows everything.
     """
-    check_pile_name(pile_file)
+    check_pile_name(pile_file.name)
     check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
     folder = None if out is None else checked_folder(out)
@@ -183,11 +184,11 @@ def _print_written(folder: Path | None, written: list[str] | None) -> None:
     short_help="Play a plan in the simulator or in discrete elements.",
     epilog="\b\nExample: wlplan simulate scan.tif plan/plan.json --out again/",
 )
-@click.argument("pile_file", metavar="PILE")
+@pile_argument(required=True)
 @click.argument("plan_file", metavar="PLAN.json")
 @with_options(engine_option, truck_option, *site_options("that of the plan"), out_option)
 def simulate(
-    pile_file: str,
+    pile_file: PileFile,
     plan_file: str,
     engine: str,
     truck: tuple[float, ...] | None,
@@ -205,7 +206,7 @@ def simulate(
     --seed changes nothing. If interrupted, the same command with --engine dem continues where it
     was.
     """
-    check_pile_name(pile_file)
+    check_pile_name(pile_file.name)
     site_named(soil, machine)  # wrong options are refused before anything heavy is imported
 
     folder = None if out is None else checked_folder(out)

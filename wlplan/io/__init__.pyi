@@ -2,8 +2,10 @@
 
 from .files import write_bytes_atomic as write_bytes_atomic
 from .files import write_text_atomic as write_text_atomic
+from .piles import ScannedPile as ScannedPile
 from .piles import bundled_pile_path as bundled_pile_path
 from .piles import read_pile as read_pile
+from .piles import read_scan as read_scan
 from .piles import write_pile as write_pile
 from .plans import PLAN_FORMAT as PLAN_FORMAT
 from .plans import plan_to_dict as plan_to_dict

@@ -8,6 +8,7 @@ the last digits of the survey's coordinates stay as they are.
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import math
 import os
@@ -38,6 +39,8 @@ _FARTHEST = 1.0e8
 # Coordinates above which whole kilometres, and heights above which whole hundreds of metres, are
 # taken off [m]: float32 resolves 1 mm at the one and 0.01 mm at the other.
 _FAR = 10_000.0
+# Slope of the ground as a whole above which a note says so [degrees].
+_SLOPING = 5.0
 _HIGH = 100.0
 
 
@@ -46,18 +49,58 @@ def bundled_pile_path() -> Path:
     return Path(str(resources.files("wlplan").joinpath("data", "marsyard2022_mound.npz")))
 
 
+@dataclasses.dataclass(frozen=True)
+class ScannedPile:
+    """What was read from a file.
+
+    Attributes:
+        pile: The pile, on the grid of the models.
+        crs: Reference system of the file, such as "EPSG:25832"; None if it names none.
+        notes: What was assumed, converted or left out, in words: sentences without their stops.
+    """
+
+    pile: Pile
+    crs: str | None
+    notes: tuple[str, ...]
+
+
 def read_pile(
     path: str | os.PathLike[str],
     *,
     ground: Float[Array | np.ndarray, "nx ny"] | float | None = None,
+    **options: Any,
 ) -> Pile:
     """Read a pile and resample it to the grid spacing of the models, 0.1 m.
 
+    As `read_scan`, whose notes go unsaid.
+
+    Args:
+        path: As there.
+        ground: As there.
+        options: As there.
+
+    Returns:
+        The pile on the 0.1 m grid, with its ground.
+
+    Raises:
+        InputError: If the file cannot be used; one line that says why and what to do.
+    """
+    return read_scan(path, ground=ground, **options).pile
+
+
+def read_scan(
+    path: str | os.PathLike[str],
+    *,
+    ground: Float[Array | np.ndarray, "nx ny"] | float | None = None,
+    **options: Any,
+) -> ScannedPile:
+    """Read a pile, with what is worth knowing of its file.
+
     The ending of the name decides the format: height maps are `.npz` or GeoTIFF, point clouds LAS,
-    LAZ or PLY, all in metres, z up. The modules of `wlplan.io.readers`, one for each format, say
-    what a file has to hold; `wlplan.io.register_reader` takes more of them. The height of a cell of
-    a point cloud is the median of its points; cells without points are unseen, but for single ones
-    amid seen cells.
+    LAZ or PLY, z up. Lengths in other units are converted to metres where the file names them. The
+    modules of `wlplan.io.readers`, one for each format, say what a file has to hold;
+    `wlplan.io.register_reader` takes more of them. The height of a cell of a point cloud is the
+    median of its points; cells without points are unseen, but for single ones amid seen cells.
 
     Unseen cells are filled smoothly from seen ones; a fill that the file brings is kept where it
     lies within the range of the seen heights. Coordinates far from zero: see the module.
@@ -67,9 +110,10 @@ def read_pile(
         ground: Floor under the pile [m] in the file's frame: a level, or a map on the grid of the
             file. By default that of the file, else `terrain.floor.estimate_ground` finds it around
             the toe. It is lowered to the surface wherever it lies above.
+        options: For the reader of the format, which names them in `OPTIONS`: `band` of a GeoTIFF.
 
     Returns:
-        The pile on the 0.1 m grid, with its ground.
+        The pile on the 0.1 m grid, with its ground, and the notes.
 
     Raises:
         InputError: If the file cannot be used; one line that says why and what to do.
@@ -78,10 +122,14 @@ def read_pile(
     reader = find_reader(path)
     check_is_file(path, "pile")
     with named(path):
+        for name in options:
+            if name not in getattr(reader, "OPTIONS", ()):
+                raise InputError(f"there is no {name} to choose in {path.suffix} files.")
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                scan = reader.read(path)
+                read: Any = reader.read
+                scan = read(path, **options)
                 if isinstance(scan, PointCloud):
                     scan = grid_points(scan)
         except InputError:
@@ -95,7 +143,20 @@ def read_pile(
             ) from error
         if not isinstance(scan, Heightmap):
             raise TypeError(f"The reader of {path} returned {scan!r}: not a Heightmap, PointCloud.")
-        return _to_pile(scan, ground)
+        pile = _to_pile(scan, ground)
+        return ScannedPile(pile, scan.crs, (*scan.notes, *_sloping(pile)))
+
+
+def _sloping(pile: Pile) -> tuple[str, ...]:
+    """A note where the ground as a whole slopes more than yards do."""
+    ground = np.asarray(pile.floor, np.float64)
+    axes = [np.linspace(-0.5 * n, 0.5 * n, n) * pile.cell_size for n in ground.shape]
+    # Least squares on a grid: the axes are apart from each other.
+    rises = [(axes[k] * ground.mean(axis=1 - k)).sum() / (axes[k] ** 2).sum() for k in (0, 1)]
+    slope = math.degrees(math.atan(math.hypot(*rises)))
+    if slope <= _SLOPING:
+        return ()
+    return (f"the ground slopes by {slope:.0f} degrees: level the scan if the site does not",)
 
 
 def _to_pile(scan: Heightmap, ground: Array | np.ndarray | float | None) -> Pile:

@@ -32,6 +32,9 @@ class Heightmap:
         origin: x and y of the centre of cell [0, 0] [m], shape [2].
         valid: Which cells were seen, shape [nx, ny]; None if all were.
         ground: Floor under the pile [m], shape [nx, ny]; None if the file has none.
+        crs: Reference system of the coordinates before they were converted to metres, such as
+            "EPSG:25832"; None if the file names none.
+        notes: What was assumed, converted or left out, in words: sentences without their stops.
     """
 
     height: np.ndarray
@@ -39,6 +42,8 @@ class Heightmap:
     origin: np.ndarray
     valid: np.ndarray | None = None
     ground: np.ndarray | None = None
+    crs: str | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,9 +52,13 @@ class PointCloud:
 
     Attributes:
         points: x, y and z [m], shape [n, 3], in any order. Points that are not finite are left out.
+        crs: As for a height map.
+        notes: Likewise.
     """
 
     points: np.ndarray
+    crs: str | None = None
+    notes: tuple[str, ...] = ()
 
 
 Scan: TypeAlias = Heightmap | PointCloud

@@ -23,8 +23,10 @@ _GENTLE = math.radians(12.0)
 # does not make its top ground, and the least that this comes to [m].
 _LOW_PART = 0.3
 _LOW_LEAST = 0.35
-# Steepest lie of the land [rad]; a steeper fit has caught the pile.
-_STEEPEST_LAND = math.radians(8.0)
+# Steepest lie of the land [rad]; a steeper fit has caught the pile, unless at least this part of
+# the edge lies this close to it [m]: then it is a sloping yard, up to the steepest of those.
+_STEEPEST_LAND, _STEEPEST_YARD = math.radians(8.0), math.radians(15.0)
+_PLANE_PART, _PLANE_NEAR = 0.7, 0.15
 # Width of the Gaussian under which slopes are taken [m], wide enough for centimetres of noise.
 _SMOOTHING = 0.25
 # Width added round the footprint, so that its edge lies on ground that no pile touches [m].
@@ -135,7 +137,9 @@ def _lie_of_the_land(
         plane = np.linalg.lstsq(basis * root[:, np.newaxis], value * root, rcond=None)[0]
         residual = value - basis @ plane
         weight = np.where(residual > 0.0, 0.25, 0.75) / np.maximum(np.abs(residual), 2.0**-step)
-    if math.hypot(plane[1], plane[2]) * scale / cell_size > math.tan(_STEEPEST_LAND):
+    slope = math.atan(math.hypot(plane[1], plane[2]) * scale / cell_size)
+    on_plane = np.mean(np.abs(value - basis @ plane) < _PLANE_NEAR) >= _PLANE_PART
+    if slope > (_STEEPEST_YARD if on_plane else _STEEPEST_LAND):
         plane = np.array([np.quantile(value, 0.1), 0.0, 0.0])
     grid_i, grid_j = np.indices(surface.shape)
     land: np.ndarray = (

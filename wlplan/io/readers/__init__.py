@@ -6,6 +6,7 @@ A reader is anything, a module as a rule, that has
 * `read(path)`: what such a file holds, a `Heightmap` or a `PointCloud` of `wlplan.io`. It raises
   `wlplan.InputError` for what the user can mend, without the name of the file and in one line.
   Whatever else it raises is taken for damage of the file.
+* if it likes, `OPTIONS`: names of keyword arguments that its `read` takes too, such as `("band",)`.
 
 A module in this folder is a reader of the package; nothing else names it. It imports only numpy and
 light modules of the package at its top, and the library of its format inside `read`, since the

@@ -1,29 +1,48 @@
-"""`.tif`, `.tiff`: GeoTIFF, band 1, with square cells along the axes, in metres.
+"""`.tif`, `.tiff`: GeoTIFF, one band of heights, with square cells along the axes.
 
-Nodata and NaN are unseen. A file without georeference is refused, since nothing gives its cell
-size.
+Lengths are converted to metres: x and y from the unit of the reference system, heights from that of
+the band, else of the system. Scale and offset of the band are applied. Nodata, NaN and cells that
+the alpha band or the mask leaves out are unseen. A file without georeference is refused, since
+nothing gives its cell size; so is a picture.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wlplan.errors import InputError
 from wlplan.io.libraries import library
+from wlplan.io.reference import Reference, length_unit, reference_of
 from wlplan.io.scans import Heightmap, check_size
 
 ENDINGS = (".tif", ".tiff")
+OPTIONS = ("band",)
+
+# What bands of heights are called.
+_HEIGHTS = re.compile(r"height|elev|altitude|\b(dsm|dtm|dem|dgm|dom|z)\b", re.IGNORECASE)
+_COLOURS = {"red", "green", "blue", "palette", "hue", "saturation", "lightness", "cyan", "magenta"}
+_COLOURS |= {"yellow", "black", "Y", "Cb", "Cr"}
+# A value at the end of all that is this far from every other is no height [m]: a file may use one
+# for its unseen cells and not say so.
+_APART = 1000.0
 
 
-def read(path: Path) -> Heightmap:
-    """Read band 1.
+def read(path: Path, *, band: int | None = None) -> Heightmap:
+    """Read the heights.
+
+    Args:
+        path: File to read.
+        band: Number of the band that holds them, from 1; by default the only one that can.
 
     Raises:
-        InputError: If there is no rasterio, or the cells are not square, along the axes and in
-            metres.
+        InputError: If rasterio or pyproj is missing, the band is not clear or a colour, the cells
+            are not square and along the axes, or the coordinates are no lengths on the ground.
     """
     with library("rasterio", install="wlplan[scan]") as rasterio, rasterio.open(path) as file:
         step = file.transform
@@ -32,23 +51,90 @@ def read(path: Path) -> Heightmap:
                 "has no georeference, so its cell size is unknown: add a world file beside it, or "
                 "save it as .npz with a `cell_size`."
             )
-        if file.crs is not None and (
-            file.crs.is_geographic or file.crs.linear_units_factor[1] != 1
-        ):
-            raise InputError("is not in metres: reproject it to a metric system such as UTM.")
+        number, notes = _band(file, band)
+        reference = Reference()
+        if file.crs is not None:
+            middle = step * (0.5 * file.width, 0.5 * file.height)
+            reference = reference_of(file.crs.to_wkt(), middle)
+        if unit := file.units[number - 1]:
+            reference = dataclasses.replace(reference, vertical=length_unit(unit))
+        horizontal, vertical, assumed = reference.factors()
         cell = abs(step.a)
         turned = max(abs(step.b), abs(step.d)) > 1e-6 * cell
         if turned or not math.isclose(cell, abs(step.e), rel_tol=1e-3):
             raise InputError("has rotated or oblong cells: resample it to square cells, north up.")
-        check_size((file.width, file.height), cell)
-        band, mask = file.read(1), file.read_masks(1) > 0
+        check_size((file.width, file.height), cell * horizontal)
+        raw, mask = file.read(number), _seen(file, number)
+        scale, shift = file.scales[number - 1], file.offsets[number - 1]
+        tagged = file.nodatavals[number - 1] is not None
+    heights = (raw.astype(np.float64) * scale + shift) * vertical
+    mask &= np.isfinite(heights)
+    if not tagged:
+        mask, more = _without_outlier(heights, mask, raw)
+        notes += more
     # Rows run from north to south and columns from west to east, unless a step says otherwise.
-    height, valid = band.T, mask.T
+    height, valid = heights.T, mask.T
     west, south = step.c, step.f
     if step.a < 0.0:
         height, valid, west = height[::-1], valid[::-1], west + step.a * len(height)
     if step.e < 0.0:
         height, valid, south = height[:, ::-1], valid[:, ::-1], south + step.e * height.shape[1]
     # A georeference names the corner of a cell, a pile its centre.
-    origin = np.array([west, south]) + 0.5 * cell
-    return Heightmap(height, cell, origin, valid & ~np.isnan(height))
+    origin = horizontal * (np.array([west, south]) + 0.5 * cell)
+    return Heightmap(
+        height, cell * horizontal, origin, valid, crs=reference.name, notes=(*assumed, *notes)
+    )
+
+
+def _band(file: Any, wanted: int | None) -> tuple[int, tuple[str, ...]]:
+    """The number of the band that holds the heights, and what is worth knowing of the choice."""
+    kinds = [kind.name for kind in file.colorinterp]
+    numbers = [k for k, kind in enumerate(kinds, 1) if kind not in _COLOURS and kind != "alpha"]
+    if wanted is not None:
+        if not 1 <= wanted <= file.count:
+            raise InputError(f"has no band {wanted}: choose one of 1 to {file.count}.")
+        numbers = [wanted] if wanted in numbers else []
+    if not numbers:
+        colours = ", ".join(kinds if wanted is None else [kinds[wanted - 1]])
+        raise InputError(
+            f"holds a picture ({colours}), not heights: give the elevation raster of the site."
+        )
+    if len(numbers) == 1:
+        return numbers[0], ()
+    named = [k for k in numbers if _HEIGHTS.search(file.descriptions[k - 1] or "")]
+    reals = [k for k in numbers if np.dtype(file.dtypes[k - 1]).kind == "f"]
+    for found in (named, reals):
+        if len(found) == 1:
+            return found[0], (f"band {found[0]} of {file.count} is taken for the heights",)
+    raise InputError(
+        f"has {file.count} bands and does not say which one holds the heights: choose it with "
+        f"--band, from 1 to {file.count}."
+    )
+
+
+def _seen(file: Any, number: int) -> np.ndarray:
+    """Cells that neither nodata nor an alpha band nor a mask leaves out, as the file has them."""
+    seen: np.ndarray = file.read_masks(number) > 0
+    # GDAL brings an alpha band to 8 bits, whatever that makes of small values.
+    for k, kind in enumerate(file.colorinterp, 1):
+        if kind.name == "alpha":
+            seen = file.read(k) > 0
+    return seen
+
+
+def _without_outlier(
+    heights: np.ndarray, seen: np.ndarray, raw: np.ndarray
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Cells without those of a single value that lies far from all others, and a note of them."""
+    values = np.unique(heights[seen])
+    if len(values) < 3:
+        return seen, ()
+    for end, next_one in ((values[0], values[1]), (values[-1], values[-2])):
+        if abs(end - next_one) > _APART:
+            odd = seen & (heights == end)
+            value = raw[odd].flat[0]
+            return seen & ~odd, (
+                f"{int(odd.sum())} cells hold {value:g} and count as unseen, though the file does "
+                f"not say so",
+            )
+    return seen, ()

@@ -1,24 +1,46 @@
-"""`.las`, `.laz`: LAS point clouds, plain or compressed; x, y, z in metres, z up."""
+"""`.las`, `.laz`: LAS point clouds, plain or compressed; x, y, z, z up.
+
+Lengths are converted to metres from the units of the reference system, WKT or GeoTIFF keys. Points
+that their classes call noise or no soil, and those that are withheld, are left out.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wlplan.errors import InputError
 from wlplan.io.libraries import library, mute_stderr
+from wlplan.io.reference import Reference, length_unit_of_code, reference_of
 from wlplan.io.scans import PointCloud
 
 ENDINGS = (".las", ".laz")
 
+# Classes of points that lie on no soil: LAS 1.4 R15, table 17.
+_NOT_SOIL = {
+    **{3: "low vegetation", 4: "medium vegetation", 5: "high vegetation", 6: "building"},
+    **{7: "noise", 9: "water", 13: "wire guard", 14: "wire", 15: "transmission tower"},
+    **{16: "wire connector", 17: "bridge deck", 18: "high noise", 19: "overhead structure"},
+}
+# Keys of a GeoTIFF directory and values of the first: OGC GeoTIFF 1.1, annex A. A code of a system
+# or a unit is a number of the EPSG registry; beyond the last one the file defines its own.
+_MODEL, _GEOGRAPHIC, _PROJECTED, _PLAN_UNIT, _VERTICAL, _HEIGHT_UNIT = (
+    *(1024, 2048, 3072, 3076, 4096, 4099),
+)
+_DEGREES, _EARTH_CENTRED = 2, 3
+_LAST_CODE = 32766
+
 
 def read(path: Path) -> PointCloud:
-    """Read all points.
+    """Read the points that lie on soil, as far as their classes say.
 
     Raises:
-        InputError: If there is no laspy, or the file has no room for what its header counts.
+        InputError: If laspy or pyproj is missing, the file has no room for what its header counts,
+            its coordinates are no lengths on the ground, or no point is left.
     """
     with library("laspy", install="wlplan[scan]") as laspy:
         _check_header(path)
@@ -32,8 +54,73 @@ def read(path: Path) -> PointCloud:
             if type(error).__name__ != "PanicException":
                 raise
             raise RuntimeError(str(error)) from error
-        axes = [np.asarray(cloud[axis], np.float64) for axis in "xyz"]
-    return PointCloud(np.stack(axes, axis=-1))
+        points = np.stack([np.asarray(cloud[axis], np.float64) for axis in "xyz"], axis=-1)
+        kept, left_out = _on_soil(cloud)
+        points = points[kept]
+        middle = (0.0, 0.0)
+        if len(points):
+            middle = (float(np.median(points[:, 0])), float(np.median(points[:, 1])))
+        reference = _reference(cloud.header, middle)
+    horizontal, vertical, assumed = reference.factors()
+    points *= (horizontal, horizontal, vertical)
+    return PointCloud(points, crs=reference.name, notes=(*assumed, *left_out))
+
+
+def _on_soil(cloud: Any) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Which points lie on soil, and what was left out, in words."""
+    classes, withheld = np.asarray(cloud.classification), np.asarray(cloud.withheld, bool)
+    counts = {
+        f"{name} (class {number})": int((~withheld & (classes == number)).sum())
+        for number, name in _NOT_SOIL.items()
+    }
+    counts["withheld"] = int(withheld.sum())
+    out = withheld | np.isin(classes, list(_NOT_SOIL))
+    parts = [f"{count} of {name}" for name, count in counts.items() if count]
+    if not parts:
+        return ~out, ()
+    left = f"of {len(classes)} points: {', '.join(parts)}"
+    if out.all():
+        raise InputError(f"holds nothing of a pile, {left}; classify its soil as ground.")
+    return ~out, (f"left out, {left}",)
+
+
+def _reference(header: Any, middle: tuple[float, float]) -> Reference:
+    """What the records of a file say about its coordinates; WKT goes before GeoTIFF keys."""
+    records = [*header.vlrs, *(header.evlrs or [])]
+    ours = [record for record in records if record.user_id.strip("\0 ") == "LASF_Projection"]
+    for record in ours:
+        if record.record_id == 2112 and (text := _text(record)):
+            return reference_of(text, middle)
+    for record in ours:
+        if record.record_id == 34735:
+            return _reference_of_keys(record.record_data_bytes(), middle)
+    return Reference()
+
+
+def _text(record: Any) -> str:
+    content: bytes = record.record_data_bytes()
+    return content.partition(b"\0")[0].decode("utf-8", "replace").strip()
+
+
+def _reference_of_keys(content: bytes, middle: tuple[float, float]) -> Reference:
+    """What a directory of GeoTIFF keys says about coordinates."""
+    shorts = np.frombuffer(content[: len(content) // 8 * 8], "<u2").reshape(-1, 4)
+    # The first entry is the head; of the others those are short values whose place is 0.
+    keys = {int(key): int(value) for key, place, _, value in shorts[1:] if place == 0}
+    plan, up = (
+        length_unit_of_code(keys[key]) if 0 < keys.get(key, 0) <= _LAST_CODE else None
+        for key in (_PLAN_UNIT, _HEIGHT_UNIT)
+    )
+    if keys.get(_MODEL) == _EARTH_CENTRED:
+        raise InputError("has earth-centred coordinates: project it to a metric system.")
+    if keys.get(_MODEL) == _DEGREES:
+        return reference_of(keys.get(_GEOGRAPHIC, 4326), middle)
+    reference = Reference(horizontal=plan)
+    if 0 < keys.get(_PROJECTED, 0) <= _LAST_CODE:
+        reference = reference_of(keys[_PROJECTED], middle, horizontal=plan)
+    if up is None and 0 < keys.get(_VERTICAL, 0) <= _LAST_CODE:
+        up = reference_of(keys[_VERTICAL], middle).vertical
+    return reference if up is None else dataclasses.replace(reference, vertical=up)
 
 
 def _check_header(path: Path) -> None:

@@ -1,7 +1,8 @@
 """`.npz`: the arrays of a height map as numpy saves them; the format of `wlplan.write_pile`.
 
 `height` [nx, ny] [m], `cell_size` [m], optional `origin` [2] [m] (centre of cell [0, 0], by default
-zero), `valid` bool [nx, ny] and `ground` [nx, ny] [m]. Axis 0 is x, axis 1 is y.
+zero), `valid` bool [nx, ny] and `ground` [nx, ny] [m]. Axis 0 is x, axis 1 is y. Without `valid`,
+cells whose height is NaN are unseen.
 """
 
 from __future__ import annotations
@@ -37,10 +38,13 @@ def read(path: Path) -> Heightmap:
     cell_size = real_numbers("cell_size", fields["cell_size"])
     if cell_size.size != 1:
         raise InputError(f"`cell_size` has shape {cell_size.shape}: it has to be one number.")
+    valid = fields.get("valid")
+    if valid is None and (unseen := np.isnan(real_numbers("height", fields["height"]))).any():
+        valid = ~unseen
     return Heightmap(
         height=fields["height"],
         cell_size=float(cell_size.reshape(())),
         origin=fields.get("origin", np.zeros(2)),
-        valid=fields.get("valid"),
+        valid=valid,
         ground=fields.get("ground"),
     )

@@ -1,4 +1,7 @@
-"""`.ply`: the vertices of an ascii or binary PLY file; x, y, z in metres, z up."""
+"""`.ply`: the vertices of an ascii or binary PLY file; x, y, z in metres, z up.
+
+The format has no place for a unit, so a note says what is assumed.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from wlplan.errors import InputError
+from wlplan.io.reference import Reference
 from wlplan.io.scans import PointCloud
 
 ENDINGS = (".ply",)
@@ -62,4 +66,4 @@ def read(path: Path) -> PointCloud:
         raise InputError(f"is PLY of unknown format {encoding!r}: export it as ascii or binary.")
     if len(columns[0]) != count:
         raise InputError(f"is cut short: {len(columns[0])} of {count} points; copy it again.")
-    return PointCloud(np.stack(columns, axis=-1))
+    return PointCloud(np.stack(columns, axis=-1), notes=Reference().factors()[2])
