@@ -230,6 +230,32 @@ def test_an_alpha_band_of_any_type_is_a_mask(tmp_path: Path) -> None:
     assert valid[42:].all()
 
 
+# --- a part of a scan
+
+
+@pytest.mark.parametrize("ending", [".tif", ".npz", ".las", ".ply"])
+def test_the_part_inside_a_rectangle_is_read(tmp_path: Path, ending: str) -> None:
+    """Beside the cone, in the same file, lies much else."""
+    path, low = tmp_path / f"a{ending}", (1000.0, 2000.0)
+    heights = np.full((200, 220), 7.0)  # rows from the north
+    heights[40:140, 60:180] = band()
+    rows, shift = points(seed=4), np.array([40.0, 0.0, 9.0])
+    rows = np.concatenate([rows, rows[::3] + shift]) + np.array([*low, 0.0])
+    if ending == ".tif":
+        write_tif(path, heights, step=0.2, west=low[0] - 12.0, north=low[1] + 28.0)
+    elif ending == ".npz":
+        origin = (low[0] - 11.9, low[1] - 11.9)
+        np.savez(path, height=heights[::-1].T, cell_size=0.2, origin=origin)
+    elif ending == ".las":
+        write_cloud(path, rows)
+    else:
+        write_ply(path, rows)
+    # Any two opposite corners.
+    part = read(path, crop=(low[0] + 24.0, low[1], low[0], low[1] + 20.0)).pile
+    np.testing.assert_allclose(np.array(part.height.shape) * 0.1, SIDES, atol=0.7)
+    refused(path, "nothing inside the crop: x runs from", crop=(0.0, 0.0, 5.0, 5.0))
+
+
 # --- point clouds
 
 

@@ -321,7 +321,21 @@ _READING = (
         default=None,
         help="Band of a GeoTIFF that holds the heights. Default: the only one that can.",
     ),
+    click.option(
+        "--crop",
+        type=Numbers("X0,Y0,X1,Y1", 4),
+        default=None,
+        help="Read only this rectangle, in the coordinates of the file.",
+    ),
+    click.option(
+        "--ground",
+        type=float,
+        default=None,
+        help="Level of the floor under the pile [m], in the heights of the scan. Default: "
+        "estimated from the ground around it.",
+    ),
 )
+_READING_NAMES = ("band", "crop", "ground")
 
 
 def pile_argument(*, required: bool = False) -> Callable[[Any], Any]:
@@ -333,8 +347,8 @@ def pile_argument(*, required: bool = False) -> Callable[[Any], Any]:
 
     def decorate(command: Any) -> Any:
         @functools.wraps(command)
-        def gathered(*, pile_file: str, band: int | None, **others: Any) -> Any:
-            given = {"band": band}
+        def gathered(*, pile_file: str, **others: Any) -> Any:
+            given = {name: others.pop(name) for name in _READING_NAMES}
             reading = {name: value for name, value in given.items() if value is not None}
             return command(pile_file=PileFile(pile_file, reading), **others)
 

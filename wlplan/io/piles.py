@@ -26,7 +26,7 @@ from wlplan.errors import InputError, one_line
 from wlplan.io.clouds import grid_points
 from wlplan.io.files import check_is_file, named, write_bytes_atomic
 from wlplan.io.readers import find_reader
-from wlplan.io.scans import Heightmap, PointCloud, check_size, real_numbers
+from wlplan.io.scans import Heightmap, PointCloud, Scan, check_size, crop, real_numbers
 from wlplan.terrain.floor import estimate_ground, fill_unseen
 from wlplan.terrain.resampling import resample
 from wlplan.types import Pile
@@ -110,7 +110,9 @@ def read_scan(
         ground: Floor under the pile [m] in the file's frame: a level, or a map on the grid of the
             file. By default that of the file, else `terrain.floor.estimate_ground` finds it around
             the toe. It is lowered to the surface wherever it lies above.
-        options: For the reader of the format, which names them in `OPTIONS`: `band` of a GeoTIFF.
+        options: `crop`, the rectangle that is read: x and y of two opposite corners, in the
+            coordinates of the file. Others are for the reader of the format, which names them in
+            `OPTIONS`: `band` of a GeoTIFF.
 
     Returns:
         The pile on the 0.1 m grid, with its ground, and the notes.
@@ -122,14 +124,17 @@ def read_scan(
     reader = find_reader(path)
     check_is_file(path, "pile")
     with named(path):
+        taken = getattr(reader, "OPTIONS", ())
         for name in options:
-            if name not in getattr(reader, "OPTIONS", ()):
+            if name not in (*taken, "crop"):
                 raise InputError(f"there is no {name} to choose in {path.suffix} files.")
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 read: Any = reader.read
-                scan = read(path, **options)
+                scan = read(path, **{name: options[name] for name in options if name in taken})
+                if "crop" in options and "crop" not in taken and isinstance(scan, Scan):
+                    scan = crop(scan, options["crop"])
                 if isinstance(scan, PointCloud):
                     scan = grid_points(scan)
         except InputError:

@@ -65,6 +65,54 @@ Scan: TypeAlias = Heightmap | PointCloud
 """What a reader returns."""
 
 
+Box: TypeAlias = tuple[float, float, float, float]
+"""A rectangle: x and y of a corner and of the opposite one, in the unit of the file."""
+
+
+def crop(scan: Scan, box: Box) -> Scan:
+    """The part of a scan inside a rectangle.
+
+    Args:
+        scan: Heights on a grid, or points.
+        box: The rectangle; cells whose centres lie inside it are kept.
+
+    Raises:
+        InputError: If nothing lies inside.
+    """
+    low, high = corners(box)
+    if isinstance(scan, PointCloud):
+        places = scan.points[:, :2]
+        inside = ((places >= low) & (places <= high)).all(axis=-1)
+        if not inside.any():
+            raise nothing_inside(places.min(axis=0), places.max(axis=0))
+        return dataclasses.replace(scan, points=scan.points[inside])
+    origin, sides = np.asarray(scan.origin, np.float64), np.array(scan.height.shape[:2])
+    first = np.clip(np.ceil((low - origin) / scan.cell_size), 0, sides).astype(int)
+    stop = np.clip(np.floor((high - origin) / scan.cell_size) + 1, 0, sides).astype(int)
+    if (first >= stop).any():
+        raise nothing_inside(origin, origin + (sides - 1) * scan.cell_size)
+    part = tuple(slice(a, b) for a, b in zip(first, stop, strict=True))
+    maps: dict[str, Any] = {
+        name: None if (field := getattr(scan, name)) is None else field[part]
+        for name in ("height", "valid", "ground")
+    }
+    return dataclasses.replace(scan, origin=origin + first * scan.cell_size, **maps)
+
+
+def corners(box: Box) -> tuple[np.ndarray, np.ndarray]:
+    """The lower left and the upper right corner of a rectangle, each [2]."""
+    pair = np.asarray(box, np.float64).reshape(2, 2)
+    return pair.min(axis=0), pair.max(axis=0)
+
+
+def nothing_inside(low: np.ndarray, high: np.ndarray) -> InputError:
+    """The complaint about a rectangle that misses a map, which spans what is given, each [2]."""
+    return InputError(
+        f"has nothing inside the crop: x runs from {low[0]:.10g} to {high[0]:.10g}, y from "
+        f"{low[1]:.10g} to {high[1]:.10g}."
+    )
+
+
 def real_numbers(name: str, values: Any) -> np.ndarray:
     """A field of a file in float64, in its own shape.
 
@@ -104,5 +152,6 @@ def check_size(shape: tuple[int, ...], cell_size: float) -> None:
     if max(*shape, *(side / CELL_SIZE for side in sides)) > _MOST_CELLS + 0.5:
         raise InputError(
             f"{text} in {shape[0]} x {shape[1]} cells: a side may have {_MOST_CELLS} cells, before "
-            f"and after resampling to {CELL_SIZE:g} m; crop it to the pile, or check the units."
+            f"and after resampling to {CELL_SIZE:g} m; crop it to the pile (--crop), or check the "
+            f"units."
         )

@@ -19,10 +19,10 @@ import numpy as np
 from wlplan.errors import InputError
 from wlplan.io.libraries import library
 from wlplan.io.reference import Reference, length_unit, reference_of
-from wlplan.io.scans import Heightmap, check_size
+from wlplan.io.scans import Box, Heightmap, check_size, corners, nothing_inside
 
 ENDINGS = (".tif", ".tiff")
-OPTIONS = ("band",)
+OPTIONS = ("band", "crop")
 
 # What bands of heights are called.
 _HEIGHTS = re.compile(r"height|elev|altitude|\b(dsm|dtm|dem|dgm|dom|z)\b", re.IGNORECASE)
@@ -33,12 +33,13 @@ _COLOURS |= {"yellow", "black", "Y", "Cb", "Cr"}
 _APART = 1000.0
 
 
-def read(path: Path, *, band: int | None = None) -> Heightmap:
+def read(path: Path, *, band: int | None = None, crop: Box | None = None) -> Heightmap:
     """Read the heights.
 
     Args:
         path: File to read.
         band: Number of the band that holds them, from 1; by default the only one that can.
+        crop: Rectangle outside of which nothing is read, in the coordinates of the file.
 
     Raises:
         InputError: If rasterio or pyproj is missing, the band is not clear or a colour, the cells
@@ -63,8 +64,13 @@ def read(path: Path, *, band: int | None = None) -> Heightmap:
         turned = max(abs(step.b), abs(step.d)) > 1e-6 * cell
         if turned or not math.isclose(cell, abs(step.e), rel_tol=1e-3):
             raise InputError("has rotated or oblong cells: resample it to square cells, north up.")
-        check_size((file.width, file.height), cell * horizontal)
-        raw, mask = file.read(number), _seen(file, number)
+        window = None
+        if crop is not None:
+            window = _window(rasterio, file, crop)
+            step = file.window_transform(window)
+        size = (file.width, file.height) if window is None else (window.width, window.height)
+        check_size(size, cell * horizontal)
+        raw, mask = file.read(number, window=window), _seen(file, number, window)
         scale, shift = file.scales[number - 1], file.offsets[number - 1]
         tagged = file.nodatavals[number - 1] is not None
     heights = (raw.astype(np.float64) * scale + shift) * vertical
@@ -112,13 +118,26 @@ def _band(file: Any, wanted: int | None) -> tuple[int, tuple[str, ...]]:
     )
 
 
-def _seen(file: Any, number: int) -> np.ndarray:
+def _window(rasterio: Any, file: Any, box: Box) -> Any:
+    """The cells whose centres lie inside a rectangle."""
+    low, high = corners(box)
+    ends = np.array([~file.transform * tuple(low), ~file.transform * tuple(high)]) - 0.5
+    sides = (file.width, file.height)
+    first = np.clip(np.ceil(ends.min(axis=0)), 0, sides).astype(int)
+    stop = np.clip(np.floor(ends.max(axis=0)) + 1, 0, sides).astype(int)
+    if (first >= stop).any():
+        all_of_it = np.array([file.transform * (0, 0), file.transform * sides])
+        raise nothing_inside(all_of_it.min(axis=0), all_of_it.max(axis=0))
+    return rasterio.windows.Window(*map(int, first), *map(int, stop - first))
+
+
+def _seen(file: Any, number: int, window: Any) -> np.ndarray:
     """Cells that neither nodata nor an alpha band nor a mask leaves out, as the file has them."""
-    seen: np.ndarray = file.read_masks(number) > 0
+    seen: np.ndarray = file.read_masks(number, window=window) > 0
     # GDAL brings an alpha band to 8 bits, whatever that makes of small values.
     for k, kind in enumerate(file.colorinterp, 1):
         if kind.name == "alpha":
-            seen = file.read(k) > 0
+            seen = file.read(k, window=window) > 0
     return seen
 
 

@@ -16,9 +16,10 @@ import numpy as np
 from wlplan.errors import InputError
 from wlplan.io.libraries import library, mute_stderr
 from wlplan.io.reference import Reference, length_unit_of_code, reference_of
-from wlplan.io.scans import PointCloud
+from wlplan.io.scans import Box, PointCloud, corners, nothing_inside
 
 ENDINGS = (".las", ".laz")
+OPTIONS = ("crop",)
 
 # Classes of points that lie on no soil: LAS 1.4 R15, table 17.
 _NOT_SOIL = {
@@ -35,8 +36,12 @@ _DEGREES, _EARTH_CENTRED = 2, 3
 _LAST_CODE = 32766
 
 
-def read(path: Path) -> PointCloud:
+def read(path: Path, *, crop: Box | None = None) -> PointCloud:
     """Read the points that lie on soil, as far as their classes say.
+
+    Args:
+        path: File to read.
+        crop: Rectangle outside of which points are left out, in the coordinates of the file.
 
     Raises:
         InputError: If laspy or pyproj is missing, the file has no room for what its header counts,
@@ -55,6 +60,12 @@ def read(path: Path) -> PointCloud:
                 raise
             raise RuntimeError(str(error)) from error
         points = np.stack([np.asarray(cloud[axis], np.float64) for axis in "xyz"], axis=-1)
+        if crop is not None:
+            low, high = corners(crop)
+            inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=-1)
+            if not inside.any():
+                raise nothing_inside(points.min(axis=0)[:2], points.max(axis=0)[:2])
+            points, cloud = points[inside], cloud[inside]
         kept, left_out = _on_soil(cloud)
         points = points[kept]
         middle = (0.0, 0.0)
