@@ -132,6 +132,16 @@ def test_next_to_nothing_is_a_page_too(document: dict[str, Any]) -> None:
         assert words in text
 
 
+def test_notes_of_the_scan_are_said() -> None:
+    document = copy.deepcopy(DOCUMENT)
+    document["pile"] |= {"crs": None, "notes": ["z converted from feet to metres", HOSTILE]}
+    text = rendered(document).text
+    assert f"Of the scan: z converted from feet to metres; {HOSTILE}." in text
+    assert "None" not in text
+    document["pile"]["notes"] = 3
+    assert "Of the scan" not in rendered(document).text
+
+
 def test_every_text_is_escaped() -> None:
     document = copy.deepcopy(DOCUMENT)
     for way, value in places(DOCUMENT):
