@@ -1,6 +1,6 @@
 """Numbers that a change of the architecture must not change, and the script that writes them.
 
-    python tests/reference_numbers.py
+    python tests/reference_numbers.py [FILE.npz]
 
 Only what users call: rollouts, plays, gradients, maps, uncertainties, plans and collected cycles of
 a fixed set of inputs. The file was written by version 0.1.0; write it anew only when the numbers
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -106,8 +107,8 @@ def flat(group: str, values: Any) -> dict[str, np.ndarray]:
 
 
 if __name__ == "__main__":
-    found: dict[str, Any] = {}
+    file, found = Path(sys.argv[1]) if sys.argv[1:] else FILE, dict[str, Any]()
     for group, make in GROUPS.items():
         found |= flat(group, make())
-    np.savez_compressed(FILE, allow_pickle=False, **found)
-    print(f"{FILE}: {len(found)} arrays, {FILE.stat().st_size / 1024:.0f} KiB")
+    np.savez_compressed(file, allow_pickle=False, **found)
+    print(f"{file}: {len(found)} arrays, {file.stat().st_size / 1024:.0f} KiB")

@@ -225,7 +225,7 @@ def _training_option(
     )
 
 
-def _option_type(setting: Setting, default: Any) -> click.ParamType[Any]:
+def _option_type(setting: Setting, default: Any) -> Any:
     """The click type of a setting, by the type of its default."""
     if setting.choices:
         return click.Choice(setting.choices)
