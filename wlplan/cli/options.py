@@ -314,28 +314,27 @@ class PileFile:
     reading: dict[str, Any]
 
 
-_READING = (
-    click.option(
+_READING = {
+    "band": click.option(
         "--band",
         type=click.IntRange(1, 65_535),
         default=None,
         help="Band of a GeoTIFF that holds the heights. Default: the only one that can.",
     ),
-    click.option(
+    "crop": click.option(
         "--crop",
         type=Numbers("X0,Y0,X1,Y1", 4),
         default=None,
         help="Read only this rectangle, in the coordinates of the file.",
     ),
-    click.option(
+    "ground": click.option(
         "--ground",
         type=float,
         default=None,
         help="Level of the floor under the pile [m], in the heights of the scan. Default: "
         "estimated from the ground around it.",
     ),
-)
-_READING_NAMES = ("band", "crop", "ground")
+}
 
 
 def pile_argument(*, required: bool = False) -> Callable[[Any], Any]:
@@ -348,12 +347,12 @@ def pile_argument(*, required: bool = False) -> Callable[[Any], Any]:
     def decorate(command: Any) -> Any:
         @functools.wraps(command)
         def gathered(*, pile_file: str, **others: Any) -> Any:
-            given = {name: others.pop(name) for name in _READING_NAMES}
+            given = {name: others.pop(name) for name in _READING}
             reading = {name: value for name, value in given.items() if value is not None}
             return command(pile_file=PileFile(pile_file, reading), **others)
 
         found: Any = gathered
-        for option in reversed(_READING):
+        for option in reversed(_READING.values()):
             found = option(found)
         if required:
             return click.argument("pile_file", metavar="PILE")(found)

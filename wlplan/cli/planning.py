@@ -223,6 +223,10 @@ def simulate(
     made_for = given.get("pile")
     if isinstance(made_for, dict) and made_for.get("sha256", source["sha256"]) != source["sha256"]:
         remark("the plan was made for another pile file than this one")
+    elif isinstance(made_for, dict) and any(
+        made_for.get(name, source[name]) != source[name] for name in ("cells", "origin")
+    ):
+        remark("the plan was made for another part of this file: read it with the same --crop")
     if (site.soil, site.machine) != (recorded.soil, recorded.machine):
         remark("the plan was made for another soil or machine than it is played with")
     objective = given.get("objective")

@@ -79,13 +79,9 @@ def crop(scan: Scan, box: Box) -> Scan:
     Raises:
         InputError: If nothing lies inside.
     """
-    low, high = corners(box)
     if isinstance(scan, PointCloud):
-        places = scan.points[:, :2]
-        inside = ((places >= low) & (places <= high)).all(axis=-1)
-        if not inside.any():
-            raise nothing_inside(places.min(axis=0), places.max(axis=0))
-        return dataclasses.replace(scan, points=scan.points[inside])
+        return dataclasses.replace(scan, points=scan.points[points_inside(scan.points, box)])
+    low, high = corners(box)
     origin, sides = np.asarray(scan.origin, np.float64), np.array(scan.height.shape[:2])
     first = np.clip(np.ceil((low - origin) / scan.cell_size), 0, sides).astype(int)
     stop = np.clip(np.floor((high - origin) / scan.cell_size) + 1, 0, sides).astype(int)
@@ -97,6 +93,19 @@ def crop(scan: Scan, box: Box) -> Scan:
         for name in ("height", "valid", "ground")
     }
     return dataclasses.replace(scan, origin=origin + first * scan.cell_size, **maps)
+
+
+def points_inside(points: np.ndarray, box: Box) -> np.ndarray:
+    """Which points, shape [n, 3], lie inside a rectangle, shape [n].
+
+    Raises:
+        InputError: If none does.
+    """
+    (low, high), places = corners(box), points[:, :2]
+    inside = np.all((places >= low) & (places <= high), axis=-1)
+    if not inside.any():
+        raise nothing_inside(places.min(axis=0), places.max(axis=0))
+    return inside
 
 
 def corners(box: Box) -> tuple[np.ndarray, np.ndarray]:

@@ -16,7 +16,7 @@ import numpy as np
 from wlplan.errors import InputError
 from wlplan.io.libraries import library, mute_stderr
 from wlplan.io.reference import Reference, length_unit_of_code, reference_of
-from wlplan.io.scans import Box, PointCloud, corners, nothing_inside
+from wlplan.io.scans import Box, PointCloud, points_inside
 
 ENDINGS = (".las", ".laz")
 OPTIONS = ("crop",)
@@ -61,10 +61,7 @@ def read(path: Path, *, crop: Box | None = None) -> PointCloud:
             raise RuntimeError(str(error)) from error
         points = np.stack([np.asarray(cloud[axis], np.float64) for axis in "xyz"], axis=-1)
         if crop is not None:
-            low, high = corners(crop)
-            inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=-1)
-            if not inside.any():
-                raise nothing_inside(points.min(axis=0)[:2], points.max(axis=0)[:2])
+            inside = points_inside(points, crop)
             points, cloud = points[inside], cloud[inside]
         kept, left_out = _on_soil(cloud)
         points = points[kept]
