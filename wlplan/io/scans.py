@@ -102,7 +102,7 @@ def points_inside(points: np.ndarray, box: Box) -> np.ndarray:
         InputError: If none does.
     """
     (low, high), places = corners(box), points[:, :2]
-    inside = np.all((places >= low) & (places <= high), axis=-1)
+    inside: np.ndarray = np.asarray(((places >= low) & (places <= high)).all(axis=-1))
     if not inside.any():
         raise nothing_inside(places.min(axis=0), places.max(axis=0))
     return inside
