@@ -25,6 +25,7 @@ from wlplan.planning.job import PlanResult
 from wlplan.planning.loading import Transport
 from wlplan.report import figures as plots
 from wlplan.report import page as report
+from wlplan.site.frame import Frame
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, SAND, Soil
 from wlplan.terrain.seed_piles import seed_pile
@@ -377,6 +378,84 @@ def test_a_plan_for_another_pile_is_told(run: Run, scan: str, tmp_path: Path) ->
     assert "another pile" in err
 
 
+def survey(folder: Path, name: str, west: float) -> Path:
+    """A scan of one and the same cone at 355,998 east and 5,200,010 north, from `west` on."""
+    x, y = np.meshgrid(west + 0.2 * np.arange(150), 5.2e6 + 0.2 * np.arange(110), indexing="ij")
+    height = np.maximum(3.0 - 0.6 * np.hypot(x - 355_998.0, y - 5_200_010.0), 0.0)
+    path = folder / name
+    np.savez(path, height=height + 431.0, cell_size=0.2, origin=np.array([west, 5.2e6]))
+    return path
+
+
+def test_a_plan_lies_where_the_scan_does(run: Run, tmp_path: Path) -> None:
+    """Two scans of a site whose local frames are a kilometre apart."""
+    monday = survey(tmp_path, "monday.npz", 355_980.0)
+    tuesday = survey(tmp_path, "tuesday.npz", 355_990.0)
+    truck = ("--truck", "355980,5200007,30")
+    code, out, _ = run("plan", monday, "--loads", 2, *truck, "--out", tmp_path / "out")
+    assert code == 0
+    assert "355" in out
+    path = tmp_path / "out" / "plan.json"
+    plan = json.loads(path.read_text())
+    assert plan["frame"] == {"offset": [355_000.0, 5_200_000.0, 400.0], "crs": None}
+    assert plan["receiver"]["x"] == pytest.approx(980.0)
+    again = json.loads(run("simulate", tuesday, path, "--json")[1])
+    assert again["frame"]["offset"] == [356_000.0, 5_200_000.0, 400.0]
+
+    def places(document: Any) -> list[float]:
+        return [part["x"] + document["frame"]["offset"][0] for part in document["loads"]]
+
+    assert places(again) == pytest.approx(places(plan), abs=1e-3)
+    assert again["receiver"]["x"] == pytest.approx(-20.0, abs=1e-3)
+    html = (tmp_path / "out" / "report.html").read_text()
+    assert "x 355980.00 m, y 5200007.00 m" in html
+    assert f"{places(plan)[0]:.2f}" in html
+
+
+def test_shortened_truck_coordinates_are_told(run: Run, tmp_path: Path) -> None:
+    scan = survey(tmp_path, "a.npz", 355_980.0)
+    code, out, err = run("plan", scan, "--loads", 1, "--truck", "980,7,30", "--json")
+    assert code == 0
+    assert "355980.0, 5200007.0" in err
+    assert json.loads(out)["receiver"]["x"] == pytest.approx(980.0)
+
+
+@pytest.mark.parametrize(
+    ("frame", "words"),
+    [
+        ({"offset": [0, 0], "crs": None}, "three numbers"),
+        ({"offset": [0, 0, 0], "crs": 4}, "three numbers"),
+        ({"offset": [0, 0, 1e300], "crs": None}, "three numbers"),
+        ([], "three numbers"),
+    ],
+)
+def test_a_frame_that_is_none_is_refused(
+    run: Run, scan: str, tmp_path: Path, frame: Any, words: str
+) -> None:
+    run("plan", scan, "--loads", 1, "--out", tmp_path / "out")
+    path = tmp_path / "out" / "plan.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "frame": frame}))
+    refused(run("simulate", scan, path), words)
+
+
+def test_systems_that_differ_are_refused() -> None:
+    frame = Frame(crs="EPSG:25832")
+    with pytest.raises(InputError, match="EPSG:25833"):
+        frame.shift_from(Frame(crs="EPSG:25833"))
+    assert frame.shift_from(Frame((1000.0, 0.0, 0.0))) == (1000.0, 0.0)
+
+
+def test_the_same_file_is_read_as_the_plan_was(run: Run, tmp_path: Path) -> None:
+    scan = survey(tmp_path, "a.npz", 355_980.0)
+    crop = "355985,5200001,356006,5200019"
+    run("plan", scan, "--loads", 1, "--crop", crop, "--out", tmp_path / "out")
+    path = tmp_path / "out" / "plan.json"
+    code, out, err = run("simulate", scan, path, "--json")
+    assert code == 0
+    assert "as the plan was made, with its --crop" in err
+    assert json.loads(out)["pile"]["cells"] == json.loads(path.read_text())["pile"]["cells"]
+
+
 def test_a_plan_that_is_none_is_refused(run: Run, scan: str, tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
     path.write_text("{}")
@@ -631,7 +710,7 @@ def test_bad_input_is_one_line(run: Run, scan: str, tmp_path: Path) -> None:
     refused(run("plan", scan, "--out", tmp_path / "file" / "below"), "is a file")
     refused(run("plan", scan, "--world", "low"), "not there yet")
     refused(run("plan", scan, "--truck", "0,0"), "on the pile")
-    refused(run("plan", scan, "--truck", "4000,0"), "frame")
+    refused(run("plan", scan, "--truck", "4000,0"), "coordinates of the scan")
     assert (tmp_path / "file").read_text() == "mine"
 
 

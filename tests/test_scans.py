@@ -81,7 +81,7 @@ def read(path: Path, **options: Any) -> ScannedPile:
 
 def test_the_cone_in_metres(tmp_path: Path) -> None:
     scan = read(write_tif(tmp_path / "a.tif", band(), step=0.2, crs="EPSG:25832", west=5e5))
-    assert (scan.crs, scan.notes) == ("EPSG:25832", ())
+    assert (scan.frame.crs, scan.notes) == ("EPSG:25832", ())
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_heights_have_the_unit_of_their_band(tmp_path: Path, unit: str, length: 
 def test_feet_of_the_reference_system_are_converted(tmp_path: Path) -> None:
     flat: dict[str, Any] = {"crs": "EPSG:2263", "west": 1e6, "north": 2e5}
     scan = read(write_tif(tmp_path / "a.tif", band() / FOOT, step=0.2 / FOOT, **flat))
-    assert scan.crs == "EPSG:2263"
+    assert scan.frame.crs == "EPSG:2263"
     assert scan.notes == (
         "the file names no unit of its heights: they are taken as US survey feet, as x and y are",
         "x and y converted from US survey feet to metres",
@@ -113,7 +113,7 @@ def test_feet_of_the_reference_system_are_converted(tmp_path: Path) -> None:
 
 def test_a_local_grid_is_a_reference_system(tmp_path: Path) -> None:
     crs = 'LOCAL_CS["site grid",UNIT["metre",1]]'
-    assert read(write_tif(tmp_path / "a.tif", band(), step=0.2, crs=crs)).crs == "site grid"
+    assert read(write_tif(tmp_path / "a.tif", band(), step=0.2, crs=crs)).frame.crs == "site grid"
 
 
 FEET = {1024: 1, 3072: 2263, 3076: 9003, 4099: 9003}

@@ -110,15 +110,15 @@ def gradcheck(
 
     if tolerance is None:
         tolerance = SIMULATOR_TOLERANCE if in_simulator else TOLERANCE
-    pile, contour, source = pile_named(pile_file, site.machine)
+    named = pile_named(pile_file, site.machine)
     world = world_named(world_name, site, model, pile_state)
     job = make_job(
         world,
-        pile,
-        site=site.with_receiver(pile, contour),
+        named.pile,
+        site=site.with_receiver(named),
         objective=objective_named(objective),
     )
-    checked_plan = random_plan(pile, loads, seed=seed, contour=contour)
+    checked_plan = random_plan(named.pile, loads, seed=seed, contour=named.contour)
     with Progress() as progress, Stopwatch() as checking:
         check = check_gradient(
             job,
@@ -130,7 +130,8 @@ def gradcheck(
 
     document = {
         "format": _FORMAT,
-        "pile": source,
+        "pile": named.fields,
+        "frame": named.frame.fields(),
         **site.fields(),
         "world": world_name,
         **model_fields(model, pile_state),
@@ -146,7 +147,7 @@ def gradcheck(
     if as_json:
         click.echo(text)
     else:
-        _print_check(check, f"{loads} loads from {source['file']}, {world_name} world")
+        _print_check(check, f"{loads} loads from {named.fields['file']}, {world_name} world")
         print(f"gradient and differences {checking.text()}")
         if folder is not None:
             print(f"written: {folder / 'gradcheck.json'}")
@@ -177,9 +178,9 @@ def _print_check(check: GradientCheck, title: str) -> None:
         f"{count} components: {count - len(kinks) - len(wrong)} ok, {len(kinks)} at kinks "
         f"({100.0 * check.kink_fraction:.1f} %), {len(wrong)} wrong"
     )
-    for word, named in (("at kinks", kinks), ("WRONG", wrong)):
-        if named:
-            print(f"{word}: {', '.join(f'load {c.load} {c.component}' for c in named)}")
+    for word, found in (("at kinks", kinks), ("WRONG", wrong)):
+        if found:
+            print(f"{word}: {', '.join(f'load {c.load} {c.component}' for c in found)}")
     print(
         f"relative error, kinks left out: largest {check.largest_error:.1e}, "
         f"median {check.median_error:.1e}; tolerance {check.tolerance:g}"

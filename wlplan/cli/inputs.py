@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wlplan.cli.options import BUNDLED, PileFile
+from wlplan.cli.options import BUNDLED, READING, PileFile
 from wlplan.cli.outputs import remark
 from wlplan.errors import InputError
 from wlplan.planning import planners
@@ -23,6 +23,7 @@ from wlplan.site.soil import GRAVEL, SOILS, Soil
 from wlplan.worlds.names import WORLDS, Learned
 
 if TYPE_CHECKING:
+    from wlplan.site.frame import Frame
     from wlplan.site.site import Site
     from wlplan.terrain.toe import ToeContour
     from wlplan.types import Pile, World
@@ -44,15 +45,13 @@ class NamedSite:
             "machine": {"name": self.machine_name, "parameters": dataclasses.asdict(self.machine)},
         }
 
-    def with_receiver(
-        self, pile: Pile, contour: ToeContour, truck: tuple[float, ...] | None = None
-    ) -> Site:
+    def with_receiver(self, named: NamedPile, truck: tuple[float, ...] | None = None) -> Site:
         """The site with its receiver.
 
         Args:
-            pile: The pile, in the frame of the scan.
-            contour: Its toe.
-            truck: x [m], y [m] and, if given, heading [degree]; None for the default place.
+            named: The pile.
+            truck: x [m] and y [m] in the coordinates of the scan and, if given, heading [degree];
+                None for the default place.
 
         Raises:
             InputError: If the place lies on the pile or far away from it.
@@ -62,11 +61,51 @@ class NamedSite:
 
         receiver = None
         if truck is not None:
-            heading = math.radians(truck[2]) if len(truck) == 3 else None
             receiver = place_receiver(
-                pile, truck[:2], heading, machine=self.machine, contour=contour
+                named.pile,
+                named.local(truck[0], truck[1]),
+                math.radians(truck[2]) if len(truck) == 3 else None,
+                machine=self.machine,
+                contour=named.contour,
+                frame=named.frame,
             )
-        return Site(machine=self.machine, soil=self.soil, receiver=receiver).beside(pile)
+        site = Site(machine=self.machine, soil=self.soil, receiver=receiver, frame=named.frame)
+        return site.beside(named.pile)
+
+
+@dataclasses.dataclass(frozen=True)
+class NamedPile:
+    """A pile that was read.
+
+    Attributes:
+        pile: In its local frame.
+        contour: Its toe.
+        frame: How the local frame lies to the coordinates of the scan.
+        fields: What plan.json says about the pile.
+    """
+
+    pile: Pile
+    contour: ToeContour
+    frame: Frame
+    fields: dict[str, Any]
+
+    def local(self, x: float, y: float) -> tuple[float, float]:
+        """A place that a person gave, in the local frame [m].
+
+        It counts as one in the coordinates of the scan, but for one that lies far away from it
+        and, shortened as the local frame is, beside the pile: that is remarked on.
+        """
+        given, local = (x, y), self.frame.local(x, y)
+        if self._is_near(given) and not self._is_near(local):
+            where = self.frame.place(x, y)
+            remark(f"{x:g},{y:g} is far from the scan: it is taken as shortened for {where}")
+            return given
+        return local
+
+    def _is_near(self, place: tuple[float, float]) -> bool:
+        size = self.pile.cell_size * max(self.pile.height.shape)
+        low = [float(value) for value in self.pile.origin]
+        return all(abs(p - a - 0.5 * size) < size + 500.0 for p, a in zip(place, low, strict=True))
 
 
 def check_pile_name(name: str) -> None:
@@ -123,8 +162,8 @@ def check_is_folder(name: str, what: str, maker: str) -> None:
         raise InputError(f"{name}: is a file: a {what} is a folder, made with `{maker}`.")
 
 
-def pile_named(file: PileFile, machine: WheelLoader) -> tuple[Pile, ToeContour, dict[str, Any]]:
-    """A pile, its toe, and what plan.json says about it; notes on the file go to stderr.
+def pile_named(file: PileFile, machine: WheelLoader) -> NamedPile:
+    """A pile with its toe; notes on the file go to stderr.
 
     Args:
         file: The pile file and how it is read.
@@ -133,11 +172,10 @@ def pile_named(file: PileFile, machine: WheelLoader) -> tuple[Pile, ToeContour, 
     Raises:
         InputError: If it cannot be read or dug.
     """
-    from wlplan.io import bundled_pile_path, read_scan
+    from wlplan.io import read_scan
     from wlplan.terrain.toe import toe_contour
 
-    name = file.name
-    path = bundled_pile_path() if name == BUNDLED else Path(name)
+    name, path = file.name, _path_of(file)
     scan = read_scan(path, **file.reading)
     for note in scan.notes:
         remark(note)
@@ -145,15 +183,54 @@ def pile_named(file: PileFile, machine: WheelLoader) -> tuple[Pile, ToeContour, 
     contour = toe_contour(pile, machine=machine)
     fields = {
         "file": f"{BUNDLED} ({path.name})" if name == BUNDLED else name,
-        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "sha256": _checksum(path),
         "cells": list(pile.height.shape),
         "cell_size": pile.cell_size,
         "origin": [float(value) for value in pile.origin],
-        "crs": scan.crs,
         "notes": list(scan.notes),
         **file.reading,
     }
-    return pile, contour, fields
+    return NamedPile(pile, contour, scan.frame, fields)
+
+
+def read_as_recorded(file: PileFile, record: object) -> PileFile:
+    """A pile file, with the options of reading that a plan recorded and that are not given anew.
+
+    Args:
+        file: As it was asked for.
+        record: What the plan says about its pile. If that is another file, nothing is taken over.
+    """
+    if not isinstance(record, dict):
+        return file
+    kept = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in record.items()
+        if name in READING and name not in file.reading
+    }
+    if not kept or record.get("sha256") != _checksum(_path_of(file)):
+        return file
+    options = ", ".join(f"--{name.replace('_', '-')}" for name in kept)
+    remark(f"the pile is read as the plan was made, with its {options}")
+    return PileFile(file.name, {**kept, **file.reading})
+
+
+def _path_of(file: PileFile) -> Path:
+    from wlplan.io import bundled_pile_path
+
+    return bundled_pile_path() if file.name == BUNDLED else Path(file.name)
+
+
+def _checksum(path: Path) -> str:
+    """SHA-256 of a file.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    from wlplan.io.files import check_is_file
+
+    check_is_file(path, "pile")
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def site_named(

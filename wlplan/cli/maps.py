@@ -91,13 +91,14 @@ def diggability(
     from wlplan.studies.diggability import diggability_map
     from wlplan.types import Action
 
-    pile, contour, source = pile_named(pile_file, site.machine)
+    named = pile_named(pile_file, site.machine)
+    pile, source = named.pile, named.fields
     world = world_named(world_name, site, model, pile_state)
     fixed = Action(*action)
     with Progress() as progress, Stopwatch() as mapping:
         progress("diggability", 0, 1, None)
         found = ready(
-            diggability_map(world, pile, locations=locations, action=fixed, contour=contour)
+            diggability_map(world, pile, locations=locations, action=fixed, contour=named.contour)
         )
         progress("diggability", 1, 1, None)
 
@@ -118,6 +119,7 @@ def diggability(
     document = {
         "format": _FORMAT,
         "pile": source,
+        "frame": named.frame.fields(),
         **site.fields(),
         "world": world_name,
         **model_fields(model, pile_state),
@@ -131,7 +133,7 @@ def diggability(
     if folder is not None:
         from wlplan.report import figures as plots
 
-        png = plots.png_bytes(plots.diggability_figure(pile, found))
+        png = plots.png_bytes(plots.diggability_figure(pile, found, frame=named.frame))
         write_files(folder, {"diggability.png": png, "diggability.json": f"{text}\n"})
     if as_json:
         click.echo(text)
@@ -144,8 +146,7 @@ def diggability(
         table.add_row(
             f"{title} [{unit}]",
             *(f"{value:.{digits}f}" for value in summary[q].values()),
-            f"{records['x'][best]:.2f}",
-            f"{records['y'][best]:.2f}",
+            *(f"{v:.2f}" for v in named.frame.scan(records["x"][best], records["y"][best])),
             f"{math.degrees(records['heading'][best]):.0f}",
         )
     print_table(table)

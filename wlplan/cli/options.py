@@ -314,7 +314,7 @@ class PileFile:
     reading: dict[str, Any]
 
 
-_READING = {
+READING = {
     "band": click.option(
         "--band",
         type=click.IntRange(1, 65_535),
@@ -335,6 +335,7 @@ _READING = {
         "estimated from the ground around it.",
     ),
 }
+"""Options of how a pile is read, by the argument of `wlplan.io.read_scan` that each gives."""
 
 
 def pile_argument(*, required: bool = False) -> Callable[[Any], Any]:
@@ -347,12 +348,12 @@ def pile_argument(*, required: bool = False) -> Callable[[Any], Any]:
     def decorate(command: Any) -> Any:
         @functools.wraps(command)
         def gathered(*, pile_file: str, **others: Any) -> Any:
-            given = {name: others.pop(name) for name in _READING}
+            given = {name: others.pop(name) for name in READING}
             reading = {name: value for name, value in given.items() if value is not None}
             return command(pile_file=PileFile(pile_file, reading), **others)
 
         found: Any = gathered
-        for option in reversed(_READING.values()):
+        for option in reversed(READING.values()):
             found = option(found)
         if required:
             return click.argument("pile_file", metavar="PILE")(found)
@@ -405,8 +406,9 @@ truck_option = click.option(
     "--truck",
     type=Numbers("X,Y[,HEADING_DEG]", 2),
     default=None,
-    help="Where the loader stands when it dumps [m], in the frame of the scan, and its heading "
-    "there. Default heading: the one with the shortest ways. Default place: 12 m west of the pile.",
+    help="Where the loader stands when it dumps [m], in the coordinates of the scan, and its "
+    "heading there. Default heading: the one with the shortest ways. Default place: 12 m west of "
+    "the pile.",
 )
 out_option = click.option(
     "--out", metavar="DIR", default=None, help="Folder to write to. It is made if it is missing."

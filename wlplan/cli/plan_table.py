@@ -9,6 +9,7 @@ from typing import Any
 from wlplan.cli.outputs import print_table, remark, titled_table
 from wlplan.constants import QUANTITIES
 from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error
+from wlplan.site.frame import frame_recorded
 
 
 def remark_on_ledger(ledger: Mapping[str, Any]) -> None:
@@ -25,9 +26,13 @@ def remark_on_ledger(ledger: Mapping[str, Any]) -> None:
 
 
 def print_plan(document: Mapping[str, Any]) -> None:
-    """The loads of a plan as a table on stdout, with sums, cost and ledger."""
+    """The loads of a plan as a table on stdout, with sums, cost and ledger.
+
+    Places are in the coordinates of the scan.
+    """
     total, ledger = document["total"], document["ledger"]
     predicted = total.get("predicted", {})
+    frame = frame_recorded(document)
     table = titled_table(f"{len(document['loads'])} loads from {document['pile']['file']}")
     table.add_column("load")
     # Short titles: all of it fits a terminal of 80 columns.
@@ -48,7 +53,7 @@ def print_plan(document: Mapping[str, Any]) -> None:
 
     for n, load in enumerate(document["loads"], start=1):
         heading = round(math.degrees(load["heading"]))
-        place = (f"{load['x']:.2f}", f"{load['y']:.2f}", f"{heading}")
+        place = (*(f"{v:.2f}" for v in frame.scan(load["x"], load["y"])), f"{heading}")
         last = n == len(document["loads"])
         table.add_row(str(n), *place, *cells(load, load["transport"]), end_section=last)
     table.add_row("sum", "", "", "", *cells(total, total["transport"]), style="bold")

@@ -16,6 +16,7 @@ from wlplan.cli.inputs import (
     objective_named,
     pile_named,
     planner_named,
+    read_as_recorded,
     site_named,
     site_recorded,
     world_named,
@@ -41,6 +42,7 @@ from wlplan.constants import QUANTITIES
 from wlplan.planning.objectives import OBJECTIVES
 
 if TYPE_CHECKING:
+    from wlplan.site.frame import Frame
     from wlplan.types import Performance
 
 _MOST_LOADS = 500
@@ -99,13 +101,14 @@ def plan(
     from wlplan.planning.plan import plan_loads, play
     from wlplan.report.document import plan_document, violations_of, write_plan_folder
 
-    pile, contour, source = pile_named(pile_file, site.machine)
+    named = pile_named(pile_file, site.machine)
+    pile = named.pile
     world = world_named(world_name, site, model, pile_state)
     simulator = world_named("simulator", site)
     goal = objective_of(objective_named(objective))
     chosen = planner_named(planner)
     in_simulator = world_name == "simulator"
-    place = site.with_receiver(pile, contour, truck)
+    place = site.with_receiver(named, truck)
     with Progress() as progress:
         with Stopwatch() as planning:
             planned = ready(
@@ -119,7 +122,7 @@ def plan(
                     seed=seed,
                     referee=simulator if referee and not in_simulator else None,
                     progress=progress,
-                    contour=contour,
+                    contour=named.contour,
                 )
             )
         with Stopwatch() as playing:
@@ -132,11 +135,10 @@ def plan(
     document = plan_document(
         pile,
         simulated,
-        receiver=place.placed_receiver,
-        dug=site.soil,
+        site=place,
         predicted=planned.rollout.performance,
         predicted_cost=float(planned.cost),
-        pile=source,
+        pile=named.fields,
         **site.fields(),
         world=world_name,
         planner=planner,
@@ -157,7 +159,7 @@ def plan(
                 document,
                 pile,
                 simulated,
-                receiver=place.placed_receiver,
+                site=place,
                 predicted=planned.rollout.performance,
                 settings={f"{name}, wall clock": text for name, text in seconds.items()},
             )
@@ -213,14 +215,17 @@ def simulate(
 
     from wlplan.io import read_plan
     from wlplan.io.files import atomic_folder
+    from wlplan.io.files import named as named_file
     from wlplan.planning.plan import play
     from wlplan.report.document import plan_document, write_plan_folder
+    from wlplan.site.frame import frame_recorded
 
     loading_plan, given = read_plan(plan_file)
     recorded = site_recorded(given, plan_file)
     site = site_named(soil, machine, otherwise=recorded)
-    pile, contour, source = pile_named(pile_file, site.machine)
     made_for = given.get("pile")
+    named = pile_named(read_as_recorded(pile_file, made_for), site.machine)
+    pile, source = named.pile, named.fields
     if isinstance(made_for, dict) and made_for.get("sha256", source["sha256"]) != source["sha256"]:
         remark("the plan was made for another pile file than this one")
     elif isinstance(made_for, dict) and any(
@@ -229,10 +234,16 @@ def simulate(
         remark("the plan was made for another part of this file: read it with the same --crop")
     if (site.soil, site.machine) != (recorded.soil, recorded.machine):
         remark("the plan was made for another soil or machine than it is played with")
+    with named_file(Path(plan_file)):
+        frame = frame_recorded(given)
+        dx, dy = named.frame.shift_from(frame)
+    loading_plan = loading_plan.replace(
+        pose=loading_plan.pose.replace(x=loading_plan.pose.x + dx, y=loading_plan.pose.y + dy)
+    )
     objective = given.get("objective")
     # A plan file must not make us import somebody else's module.
     objective = objective if objective in OBJECTIVES else next(iter(OBJECTIVES))
-    place = site.with_receiver(pile, contour, truck if truck is not None else _truck_of(given))
+    place = site.with_receiver(named, truck if truck is not None else _truck_of(given, frame))
     cycles: list[Any] = []
     count = len(given["loads"])
     with Progress() as progress, Stopwatch() as playing:
@@ -260,11 +271,10 @@ def simulate(
     document = plan_document(
         pile,
         played,
-        receiver=place.placed_receiver,
-        dug=site.soil,
+        site=place,
         predicted=predicted,
         predicted_cost=None if predicted is None else _predicted_cost(given),
-        pile=source,
+        pile=named.fields,
         **site.fields(),
         **{name: given[name] for name in _ORIGIN_FIELDS if name in given},
         objective=objective,
@@ -281,7 +291,7 @@ def simulate(
                 document,
                 pile,
                 played,
-                receiver=place.placed_receiver,
+                site=place,
                 predicted=predicted,
                 settings={f"{engine}, wall clock": playing.text()},
             )
@@ -294,8 +304,8 @@ def simulate(
     _print_written(folder, written)
 
 
-def _truck_of(document: Mapping[str, Any]) -> tuple[float, ...] | None:
-    """The truck that a plan was made for, as of the option; None if it names none."""
+def _truck_of(document: Mapping[str, Any], frame: Frame) -> tuple[float, ...] | None:
+    """The truck that a plan in a frame was made for, as of the option; None if it names none."""
     from wlplan.report.document import RECEIVER_FIELDS
 
     record = document.get("receiver")
@@ -303,7 +313,7 @@ def _truck_of(document: Mapping[str, Any]) -> tuple[float, ...] | None:
     if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
         return None
     x, y, heading = (float(v) for v in values if v is not None)
-    return x, y, math.degrees(heading)
+    return *frame.scan(x, y), math.degrees(heading)
 
 
 def _predicted_of(document: Mapping[str, Any]) -> Performance | None:

@@ -27,6 +27,7 @@ from wlplan.io.clouds import grid_points
 from wlplan.io.files import check_is_file, named, write_bytes_atomic
 from wlplan.io.readers import find_reader
 from wlplan.io.scans import Heightmap, PointCloud, Scan, check_size, crop, real_numbers
+from wlplan.site.frame import Frame
 from wlplan.terrain.floor import estimate_ground, fill_unseen
 from wlplan.terrain.resampling import resample
 from wlplan.types import Pile
@@ -54,13 +55,13 @@ class ScannedPile:
     """What was read from a file.
 
     Attributes:
-        pile: The pile, on the grid of the models.
-        crs: Reference system of the file, such as "EPSG:25832"; None if it names none.
+        pile: The pile, on the grid of the models, in its local frame.
+        frame: How that lies to the coordinates of the file, and their reference system.
         notes: What was assumed, converted or left out, in words: sentences without their stops.
     """
 
     pile: Pile
-    crs: str | None
+    frame: Frame
     notes: tuple[str, ...]
 
 
@@ -148,8 +149,8 @@ def read_scan(
             ) from error
         if not isinstance(scan, Heightmap):
             raise TypeError(f"The reader of {path} returned {scan!r}: not a Heightmap, PointCloud.")
-        pile = _to_pile(scan, ground)
-        return ScannedPile(pile, scan.crs, (*scan.notes, *_sloping(pile)))
+        pile, frame = _to_pile(scan, ground)
+        return ScannedPile(pile, frame, (*scan.notes, *_sloping(pile)))
 
 
 def _sloping(pile: Pile) -> tuple[str, ...]:
@@ -164,7 +165,7 @@ def _sloping(pile: Pile) -> tuple[str, ...]:
     return (f"the ground slopes by {slope:.0f} degrees: level the scan if the site does not",)
 
 
-def _to_pile(scan: Heightmap, ground: Array | np.ndarray | float | None) -> Pile:
+def _to_pile(scan: Heightmap, ground: Array | np.ndarray | float | None) -> tuple[Pile, Frame]:
     """Check a scan, fill its gaps, resample it and find its ground."""
     height, origin = real_numbers("height", scan.height), real_numbers("origin", scan.origin)
     if height.ndim != 2:
@@ -208,13 +209,13 @@ def _to_pile(scan: Heightmap, ground: Array | np.ndarray | float | None) -> Pile
         floor = np.minimum(fill_unseen(floor, known), height)
 
     centre = origin + 0.5 * scan.cell_size * np.array(shape)
-    origin = origin - np.where(np.abs(centre) > _FAR, 1000.0 * np.floor(centre / 1000.0), 0.0)
+    offset = np.where(np.abs(centre) > _FAR, 1000.0 * np.floor(centre / 1000.0), 0.0)
     sea_level = 100.0 * math.floor(low / 100.0) if abs(low) > _HIGH else 0.0
     pile = resample(
         Pile(
             height=floats(height - sea_level),
             cell_size=scan.cell_size,
-            origin=floats(origin),
+            origin=floats(origin - offset),
             ground=None if floor is None else floats(floor - sea_level),
             valid=None if valid.all() else jnp.asarray(valid),
         ),
@@ -223,7 +224,8 @@ def _to_pile(scan: Heightmap, ground: Array | np.ndarray | float | None) -> Pile
     if floor is None:
         found = floats(estimate_ground(pile.height, CELL_SIZE, pile.valid))
         pile = pile.replace(ground=jnp.minimum(found, pile.height))
-    return pile.replace(cell_size=CELL_SIZE)
+    frame = Frame((float(offset[0]), float(offset[1]), sea_level), scan.crs)
+    return pile.replace(cell_size=CELL_SIZE), frame
 
 
 def _valid(valid: np.ndarray | None, shape: tuple[int, ...]) -> Bool[np.ndarray, "nx ny"]:

@@ -18,6 +18,7 @@ from wlplan.planning.objective import Objective, objective_of
 from wlplan.planning.poses import Toe, pose_at, toe_of
 from wlplan.planning.rollout import closed_loop
 from wlplan.planning.transport import transport
+from wlplan.site.frame import LOCAL
 from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour, toe_contour
 from wlplan.types import (
@@ -66,10 +67,12 @@ def make_job(
     """
     check_world(world)
     check_pile(pile)
+    beside = (Site() if site is None else site).beside(pile)
     return Job(
         world=as_pytree(world),
         pile=pile,
-        site=(Site() if site is None else site).beside(pile),
+        # Nothing that is computed depends on the frame: what is compiled serves all of them.
+        site=beside.replace(frame=LOCAL),
         objective=objective_of(objective),
     )
 

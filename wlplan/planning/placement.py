@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from wlplan.errors import InputError
 from wlplan.planning.transport import v_turn_length
+from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.receiver import Receiver
 from wlplan.terrain.heightmap import sample
@@ -33,15 +34,17 @@ def place_receiver(
     *,
     machine: WheelLoader = WA320,
     contour: ToeContour | None = None,
+    frame: Frame = LOCAL,
 ) -> Receiver:
     """A receiver at a place.
 
     Args:
-        pile: The pile, in the frame of the scan.
-        place: x and y [m].
+        pile: The pile.
+        place: x and y [m], in the frame of the pile.
         heading: Of the loader as it dumps [rad]; None: the one with the shortest ways.
         machine: What drives there.
         contour: Toe of the pile where it is known already.
+        frame: What complaints give places in.
 
     Raises:
         InputError: If the place lies on the pile or far away from it.
@@ -51,16 +54,19 @@ def place_receiver(
     low = np.asarray(pile.origin, float)
     away = math.hypot(*(np.array([x, y]) - low - 0.5 * size))
     if not away <= _FARTHEST:
+        first, last = frame.scan(*low), frame.scan(*(low + size))
         raise InputError(
-            f"the truck at {x:g},{y:g} is {away:.0f} m from the middle of the map, which spans x "
-            f"{low[0]:.1f} to {low[0] + size[0]:.1f} and y {low[1]:.1f} to {low[1] + size[1]:.1f} "
-            f"m: give it in that frame (whole kilometres of survey coordinates are taken off)."
+            f"the truck at {frame.place(x, y)} is {away:.0f} m from the middle of the scan, which "
+            f"spans x {first[0]:.1f} to {last[0]:.1f} and y {first[1]:.1f} to {last[1]:.1f} m: "
+            f"give it in the coordinates of the scan."
         )
     dtype = pile.height.dtype
     point = jnp.asarray(x, dtype), jnp.asarray(y, dtype)
     inside = bool(np.all((np.array([x, y]) >= low) & (np.array([x, y]) <= low + size)))
     if inside and float(sample(pile.height - pile.floor, pile, *point)) > _ON_PILE:
-        raise InputError(f"the truck at {x:g},{y:g} is on the pile: give a place beside it.")
+        raise InputError(
+            f"the truck at {frame.place(x, y)} is on the pile: give a place beside it."
+        )
     if heading is None:
         heading = _heading_of_shortest_ways(pile, point, machine, contour)
     return Receiver(*point, jnp.asarray(math.remainder(heading, 2.0 * math.pi), dtype))

@@ -14,6 +14,7 @@ from wlplan.constants import KG_PER_TONNE, QUANTITIES
 from wlplan.io.plans import plan_to_dict
 from wlplan.planning.job import PlanResult
 from wlplan.site.receiver import Receiver
+from wlplan.site.site import Site
 from wlplan.site.soil import Soil
 from wlplan.types import Performance, Pile, SolveReport
 
@@ -30,8 +31,7 @@ def plan_document(
     before: Pile,
     simulated: PlanResult,
     *,
-    receiver: Receiver,
-    dug: Soil,
+    site: Site,
     predicted: Performance | None = None,
     predicted_cost: float | None = None,
     **origin: Any,
@@ -41,8 +41,7 @@ def plan_document(
     Args:
         before: The pile before the first loading.
         simulated: The plan as it was played.
-        receiver: Where its loads go.
-        dug: The soil; its density closes the ledger.
+        site: Where: its receiver, its frame, and its soil, whose density closes the ledger.
         predicted: What the world that planned foresaw, leaves [N]; None: nothing is known of it.
         predicted_cost: Cost of the plan in that world.
         **origin: Further top-level fields: pile, soil, machine, world, planner, objective, seed.
@@ -62,9 +61,10 @@ def plan_document(
         simulated=simulated.rollout.performance,
         transport={"time": simulated.transport.time, "work": simulated.transport.work},
         **origin,
-        receiver=receiver_fields(receiver),
+        frame=site.frame.fields(),
+        receiver=receiver_fields(site.placed_receiver),
         total=total,
-        ledger=ledger_of(before, simulated, dug),
+        ledger=ledger_of(before, simulated, site.soil),
     )
 
 
@@ -121,7 +121,7 @@ def write_plan_folder(
     pile: Pile,
     simulated: PlanResult,
     *,
-    receiver: Receiver,
+    site: Site,
     predicted: Performance | None = None,
     settings: Mapping[str, str] | None = None,
 ) -> list[str]:
@@ -132,7 +132,7 @@ def write_plan_folder(
         document: Content of the plan.json, see `plan_document`.
         pile: The pile before the first loading.
         simulated: The plan as it was played.
-        receiver: Where its loads go.
+        site: With its receiver and its frame.
         predicted: What the world that planned foresaw, leaves [N], if it is known.
         settings: Further lines for the page's table of settings, by name.
 
@@ -153,7 +153,8 @@ def write_plan_folder(
             pile,
             simulated.rollout.pile,
             simulated.plan,
-            receiver=receiver,
+            receiver=site.placed_receiver,
+            frame=site.frame,
             after_title=f"After {count} load{'s' if count > 1 else ''} in the simulator",
         )
     )

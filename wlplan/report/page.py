@@ -20,6 +20,7 @@ from jinja2 import ChainableUndefined, Environment, Template
 from wlplan.constants import QUANTITIES, Quantity
 from wlplan.io import write_text_atomic
 from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error, volume_lost
+from wlplan.site.frame import frame_recorded
 
 REPORT_NAME = "report.html"
 
@@ -66,6 +67,7 @@ def render_report(
     error = ledger_error(ledger)
     return _template().render(
         document=document,
+        offset=frame_recorded(document).offset,
         quantities=QUANTITIES,
         cards=_CARDS,
         ledger={
@@ -91,6 +93,7 @@ def _template() -> Template:
         keep_trailing_newline=True,
     )
     environment.filters |= {
+        "coordinate": _coordinate,
         "degrees": _degrees,
         "difference": _difference,
         "number": _number,
@@ -110,6 +113,12 @@ def _number(value: object, digits: int = 2) -> str:
     """A number for people; a dash where there is none."""
     number = _finite(value)
     return _DASH if number is None else f"{number:,.{digits}f}".replace("-", _MINUS)
+
+
+def _coordinate(value: object, offset: float) -> str:
+    """A local coordinate in that of the scan [m]; a dash if it is missing."""
+    number = _finite(value)
+    return _DASH if number is None else f"{number + offset:.2f}".replace("-", _MINUS)
 
 
 def _degrees(angle: object) -> int | None:

@@ -6,6 +6,7 @@ from typing import no_type_check
 
 from flax import struct
 
+from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.presets import check_machine, check_soil
 from wlplan.site.receiver import Receiver, default_receiver
@@ -20,6 +21,7 @@ class Site(struct.PyTreeNode):
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     receiver: Receiver | None = None  # None: the default place beside whatever pile there is
+    frame: Frame = struct.field(pytree_node=False, default=LOCAL)  # that everything here is in
 
     @property
     def placed_receiver(self) -> Receiver:

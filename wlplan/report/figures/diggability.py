@@ -21,6 +21,7 @@ from wlplan.report.figures.relief import (
     view_of,
 )
 from wlplan.report.figures.style import FAINT, INK, frame_map, new_figure, tidy
+from wlplan.site.frame import LOCAL, Frame
 from wlplan.studies.diggability import DiggabilityMap
 from wlplan.types import Pile
 
@@ -30,7 +31,7 @@ _TICK = 1.5
 _TICK_PART = 0.09
 
 
-def diggability_figure(pile: Pile, diggability: DiggabilityMap) -> Figure:
+def diggability_figure(pile: Pile, diggability: DiggabilityMap, *, frame: Frame = LOCAL) -> Figure:
     """Mass, time and work of one action at locations around the pile.
 
     The colours of the lines, which stand on the toe along the inward normals, are those of the
@@ -39,6 +40,7 @@ def diggability_figure(pile: Pile, diggability: DiggabilityMap) -> Figure:
     Args:
         pile: The pile the map was made for.
         diggability: Poses and performance, leaves [n].
+        frame: What the coordinates on the axes are in.
     """
     pose = diggability.pose
     digs = np.stack([np.asarray(pose.x), np.asarray(pose.y)], axis=-1).astype(float)
@@ -59,7 +61,7 @@ def diggability_figure(pile: Pile, diggability: DiggabilityMap) -> Figure:
         edges = _bins(values)
         scale = Normalize(edges[0], edges[-1])
         draw_pile(panel, pile, STONE, norm, contour_alpha=0.35)
-        frame_map(panel, view, f"{label} [{unit}]")
+        frame_map(panel, view, f"{label} [{unit}]", frame)
         _draw_ticks(panel, ticks, scale(values))
         _draw_histogram(histogram, values, edges, scale)
         histogram.set_title(

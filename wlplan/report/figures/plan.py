@@ -19,6 +19,7 @@ from wlplan.report.figures.relief import (
 )
 from wlplan.report.figures.style import BLUE, frame_map, map_panels
 from wlplan.report.figures.truck import Truck, draw_truck
+from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.receiver import Receiver
 from wlplan.types import LoadingPlan, Pile
 
@@ -29,6 +30,7 @@ def plan_figure(
     plan: LoadingPlan,
     *,
     receiver: Receiver | None = None,
+    frame: Frame = LOCAL,
     after_title: str | None = None,
 ) -> Figure:
     """The pile with its numbered digs, and the pile that is left, side by side.
@@ -40,6 +42,7 @@ def plan_figure(
         after: Pile after the last one, on the same grid.
         plan: N loadings in order, leaves [N].
         receiver: Where the loader dumps, drawn as a truck across its heading.
+        frame: What the coordinates on the axes are in.
         after_title: Title of the second panel; by default the number of loads.
     """
     digs = np.stack([np.asarray(plan.pose.x), np.asarray(plan.pose.y)], axis=-1).astype(float)
@@ -61,7 +64,7 @@ def plan_figure(
     titles = (f"Before, with {loads} planned", after_title or f"After {loads}")
     for panel, pile, title in zip(panels, (before, after), titles, strict=True):
         draw_pile(panel, pile, PILE, norm)
-        frame_map(panel, view, title)
+        frame_map(panel, view, title, frame)
         if truck is not None:
             draw_truck(panel, truck, view)
     draw_digs(panels[0], digs, heading, labels, radius)

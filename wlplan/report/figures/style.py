@@ -8,6 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from wlplan.site.frame import LOCAL, Frame
 
 # Colours that people with the common kinds of colour blindness tell apart.
 INK = "#1d2733"
@@ -34,8 +37,10 @@ def map_panels(view: Float[np.ndarray, "2 2"], count: int) -> tuple[Figure, list
     return figure, list(np.atleast_1d(figure.subplots(1, count)))
 
 
-def frame_map(panel: Axes, view: Float[np.ndarray, "2 2"], title: str) -> None:
-    """Limits, labels and title of a map [m]."""
+def frame_map(
+    panel: Axes, view: Float[np.ndarray, "2 2"], title: str, frame: Frame = LOCAL
+) -> None:
+    """Limits, labels and title of a map [m]; the labels are in the coordinates of the scan."""
     panel.set_xlim(view[0, 0], view[1, 0])
     panel.set_ylim(view[0, 1], view[1, 1])
     panel.set_aspect("equal")
@@ -43,7 +48,16 @@ def frame_map(panel: Axes, view: Float[np.ndarray, "2 2"], title: str) -> None:
     panel.set_xlabel("x, east [m]")
     panel.set_ylabel("y, north [m]")
     panel.set_facecolor("white")
+    for axis, offset in ((panel.xaxis, frame.offset[0]), (panel.yaxis, frame.offset[1])):
+        if offset:
+            axis.set_major_locator(MaxNLocator(4))
+            axis.set_major_formatter(_shifted(offset))
     tidy(panel, grid=False)
+
+
+def _shifted(offset: float) -> FuncFormatter:
+    """Labels of an axis that add an offset [m]."""
+    return FuncFormatter(lambda value, _: f"{value + offset:.10g}")
 
 
 def tidy(panel: Axes, *, grid: bool = True) -> None:
