@@ -56,7 +56,7 @@ class NamedSite:
         Raises:
             InputError: If the place lies on the pile or far away from it.
         """
-        from wlplan.planning.placement import place_receiver
+        from wlplan.planning.placement import beside, place_receiver
         from wlplan.site.site import Site
 
         receiver = None
@@ -70,7 +70,7 @@ class NamedSite:
                 frame=named.frame,
             )
         site = Site(machine=self.machine, soil=self.soil, receiver=receiver, frame=named.frame)
-        return site.beside(named.pile)
+        return beside(site, named.pile, named.contour)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,16 +8,19 @@ from typing import Any, no_type_check
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
 from wlplan.actions import squash
 from wlplan.checks import check_pile, check_world
 from wlplan.errors import InputError
 from wlplan.planning.loading import Loading, Transport
 from wlplan.planning.objective import Objective, objective_of
+from wlplan.planning.placement import beside
 from wlplan.planning.poses import Toe, pose_at, toe_of
 from wlplan.planning.rollout import closed_loop
 from wlplan.planning.transport import transport
+from wlplan.planning.way import Way, room_of, unseen_along
+from wlplan.planning.yard import Yard, packed_soil, yard_of
 from wlplan.site.frame import LOCAL
 from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour, toe_contour
@@ -43,6 +46,7 @@ class Job(struct.PyTreeNode):
     pile: Pile
     site: Site  # with its receiver
     objective: Objective = struct.field(pytree_node=False)
+    yard: Yard  # room to drive around the pile
     toe: Toe | None = None  # to dig along; None where plans with poses of their own are played
 
 
@@ -52,6 +56,7 @@ def make_job(
     *,
     site: Site | None = None,
     objective: str | Objective | Mapping[str, Any] | Callable[..., Any] = "efficiency",
+    contour: ToeContour | None = None,
 ) -> Job:
     """A job without a toe, once everything that users get wrong was looked at.
 
@@ -59,21 +64,23 @@ def make_job(
         world: World to plan or play in.
         pile: The pile before the first loading.
         site: Machine, soil and receiver; default: the WA320 in gravel. Without a receiver it has
-            the default one of the pile.
+            one beside the pile.
         objective: A name, an `Objective`, named terms, or a function of a loading.
+        contour: Toe of the pile where it is known already.
 
     Raises:
         InputError: If one of them cannot be used; one line that says what to do.
     """
     check_world(world)
     check_pile(pile)
-    beside = (Site() if site is None else site).beside(pile)
+    placed = beside(Site() if site is None else site, pile, contour)
     return Job(
         world=as_pytree(world),
         pile=pile,
         # Nothing that is computed depends on the frame: what is compiled serves all of them.
-        site=beside.replace(frame=LOCAL),
+        site=placed.replace(frame=LOCAL),
         objective=objective_of(objective),
+        yard=yard_of(pile, placed.machine),
     )
 
 
@@ -111,6 +118,7 @@ class PlanResult(struct.PyTreeNode):
     terms: dict[str, Float[Array, " n"]]  # of the objective, by name, without their weights
     costs: Float[Array, " n"]  # of the loadings
     cost: Float[Array, ""]  # their sum
+    ways: Ways | None = None  # leaves (N, ...); None: nobody asked for them
     solves: SolveReport | None = None  # leaves (N,); None: the world does not say
     refereed: PlanResult | None = None  # the same plan played by the referee, if there was one
 
@@ -121,6 +129,15 @@ def decide(job: Job, pile: Pile, decisions: Decisions) -> tuple[Pose, Action]:
     return pose_at(job.toe, pile, decisions.position, decisions.offset), squash(decisions.action)
 
 
+@no_type_check
+class Ways(struct.PyTreeNode):
+    """The ways to the receiver that a plan takes, leaves (N, ...), and the room for them."""
+
+    way: Way
+    unseen: Float[Array, "*n"]  # of it over ground that the scan did not see [m]
+    soil: UInt8[Array, "*n bytes"]  # before the loading, see `packed_soil`
+
+
 class Assessed(struct.PyTreeNode):
     """A loading that was played, and what it counts."""
 
@@ -129,6 +146,7 @@ class Assessed(struct.PyTreeNode):
     transport: Transport
     terms: dict[str, Array]
     cost: Array
+    ways: Ways
 
 
 def assess(job: Job, pile: Pile, pose: Pose, action: Action, performance: Performance) -> Assessed:
@@ -141,10 +159,15 @@ def assess(job: Job, pile: Pile, pose: Pose, action: Action, performance: Perfor
         action: Parameters of the bucket-filling controller.
         performance: What the loading yields.
     """
-    way = transport(pose, performance.mass, job.site)
-    loading = Loading(pile, pose, action, performance, way, job.site)
+    room = room_of(job.yard, pile)
+    carried, way = transport(pile, pose, performance.mass, job.site, room)
+    loading = Loading(pile, pose, action, performance, carried, job.site)
     terms = job.objective.values(loading)
-    return Assessed(LoadingPlan(pose, action), performance, way, terms, job.objective.cost(terms))
+    ways = Ways(
+        way, unseen_along(way, job.yard, job.site.machine.turning_radius), packed_soil(pile)
+    )
+    plan = LoadingPlan(pose, action)
+    return Assessed(plan, performance, carried, terms, job.objective.cost(terms), ways)
 
 
 def assemble(loadings: Assessed, pile: Pile, solves: SolveReport | None = None) -> PlanResult:
@@ -156,6 +179,7 @@ def assemble(loadings: Assessed, pile: Pile, solves: SolveReport | None = None) 
         terms=loadings.terms,
         costs=loadings.cost,
         cost=loadings.cost.sum(),
+        ways=loadings.ways,
         solves=solves,
     )
 

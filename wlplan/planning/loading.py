@@ -17,6 +17,8 @@ class Transport(struct.PyTreeNode):
 
     time: Float[Array, "*n"]  # dumping included [s]
     work: Float[Array, "*n"]  # [kJ]
+    # How much of the way and of the approach lane leads through what must not be touched [m].
+    touching: Float[Array, "*n"] = 0.0  # type: ignore[assignment]
 
 
 @no_type_check

@@ -1,30 +1,64 @@
-"""Where the loader dumps, from what a person says about it."""
+"""Where the loader dumps: where a person says, or where the ways are short."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 from wlplan.errors import InputError
-from wlplan.planning.transport import v_turn_length
+from wlplan.planning.way import Room, room_of, way_to
+from wlplan.planning.yard import CLEARED, standing, yard_of
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
-from wlplan.site.receiver import Receiver
+from wlplan.site.presets import check_machine, check_soil
+from wlplan.site.receiver import Receiver, truck_outline
+from wlplan.site.site import Site
 from wlplan.terrain.heightmap import sample
 from wlplan.terrain.toe import ToeContour, edge_poses, toe_contour
-from wlplan.types import Pile
+from wlplan.types import Pile, Pose
 
 # Farthest that a receiver may be from the middle of the map [m].
 _FARTHEST = 500.0
 # Height above the floor that counts as on the pile [m].
 _ON_PILE = 0.5
-# Dig locations and headings over which the ways are averaged.
-_LOCATIONS, _HEADING_STEP = 24, 5.0
+# Dig locations around the pile, and how many of them, the nearest, a place is judged by.
+_LOCATIONS, _NEAREST = 24, 6
+_HEADING_STEP = 15.0
+# Places for the receiver, in the frame of a dig pose: metres behind it and beside it, and degrees
+# between the headings, either side. They have the shortest ways from a straight face, in the mean
+# over three digs 3 m apart, of all places 1 m and 15 degrees apart; then two further back.
+_STANDS = ((8.0, 4.0, 75.0), (9.0, 3.0, 90.0), (7.0, 6.0, 90.0), (12.0, 0.0, 120.0))
+_FURTHER = ((13.0, 6.0, 90.0), (16.0, 4.0, 105.0))
+# What a metre of way through an obstacle, and the part of the truck that stands on something or
+# where the scan saw nothing, are worth in metres of way.
+_TOUCHING, _TRUCK_ON, _TRUCK_UNSEEN = 20.0, 40.0, 2.0
+# Places that are judged at once.
+_BATCH = 32
+
+
+def beside(site: Site, pile: Pile, contour: ToeContour | None = None) -> Site:
+    """The site with a receiver: its own, or one beside a pile.
+
+    Args:
+        site: Any site.
+        pile: The pile.
+        contour: Its toe where it is known already.
+
+    Raises:
+        InputError: If soil or machine make no sense, or there is no place beside the pile since a
+            bucket can start nowhere.
+    """
+    check_soil(site.soil)
+    check_machine(site.machine)
+    if site.receiver is not None:
+        return site
+    return site.replace(receiver=best_receiver(pile, machine=site.machine, contour=contour))
 
 
 def place_receiver(
@@ -68,22 +102,127 @@ def place_receiver(
             f"the truck at {frame.place(x, y)} is on the pile: give a place beside it."
         )
     if heading is None:
-        heading = _heading_of_shortest_ways(pile, point, machine, contour)
+        degrees = np.arange(-180.0, 180.0, _HEADING_STEP)
+        places = np.array([[x, y, math.radians(d)] for d in degrees])
+        heading = float(_best(places, pile, machine, contour)[2])
     return Receiver(*point, jnp.asarray(math.remainder(heading, 2.0 * math.pi), dtype))
 
 
-def _heading_of_shortest_ways(
-    pile: Pile, place: tuple[Array, Array], machine: WheelLoader, contour: ToeContour | None
-) -> float:
-    """Heading [rad] at a place x, y [m] from where the ways to the toe are shortest on average."""
-    dtype = pile.height.dtype
+def best_receiver(
+    pile: Pile, *, machine: WheelLoader = WA320, contour: ToeContour | None = None
+) -> Receiver:
+    """The receiver beside a pile from where the ways to the toe nearby are shortest.
+
+    The truck keeps off the pile and what stands around it, and rather off unseen ground.
+
+    Args:
+        pile: The pile.
+        machine: What drives there.
+        contour: Toe of the pile where it is known already.
+
+    Raises:
+        InputError: If a bucket can start nowhere on the toe.
+    """
     contour = toe_contour(pile, machine=machine) if contour is None else contour
-    poses = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), edge_poses(contour, _LOCATIONS))
-    headings = np.radians(np.arange(-180.0, 180.0, _HEADING_STEP))
+    digs = edge_poses(contour, _LOCATIONS)
+    x, y, into = (np.asarray(v, float)[:, None] for v in (digs.x, digs.y, digs.heading))
+    back, side, turn = np.array(
+        [(b, sign * s, sign * t) for b, s, t in (*_STANDS, *_FURTHER) for sign in (1.0, -1.0)]
+    ).T
+    places = np.stack(
+        [
+            x - back * np.cos(into) - side * np.sin(into),
+            y - back * np.sin(into) + side * np.cos(into),
+            into + np.radians(turn),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    dtype = pile.height.dtype
+    px, py, heading = _best(places, pile, machine, contour)
+    heading = math.remainder(heading, 2.0 * math.pi)
+    return Receiver(*(jnp.asarray(v, dtype) for v in (px, py, heading)))
 
-    def length(heading: Array) -> Array:
-        receiver = Receiver(*place, heading)
-        return jax.vmap(lambda pose: v_turn_length(pose, receiver, machine=machine))(poses).mean()
 
-    lengths = jax.jit(jax.vmap(length))(jnp.asarray(headings, dtype))
-    return float(headings[int(np.argmin(lengths))])
+def _best(
+    places: Float[np.ndarray, "n 3"],
+    pile: Pile,
+    machine: WheelLoader,
+    contour: ToeContour | None,
+) -> Float[np.ndarray, "3"]:
+    """The place x [m], y [m], heading [rad] with the shortest ways and room for the truck."""
+    contour = toe_contour(pile, machine=machine) if contour is None else contour
+    digs = edge_poses(contour, _LOCATIONS)
+    poses = np.stack([np.asarray(v, float) for v in (digs.x, digs.y, digs.heading)], axis=-1)
+    apart = np.hypot(*(places[:, None, :2] - poses[None, :, :2]).transpose(2, 0, 1))
+    nearest = poses[np.argsort(apart, axis=1)[:, :_NEAREST]]
+    room = room_of(yard_of(pile, machine), pile)
+    # Always as many at once, whatever the pile: they are compiled for once.
+    rows = np.minimum(np.arange(-(-len(places) // _BATCH) * _BATCH), len(places) - 1)
+    dtype = pile.height.dtype
+    ways = [
+        np.asarray(
+            _mean_ways(
+                jnp.asarray(places[part], dtype), jnp.asarray(nearest[part], dtype), room, machine
+            )
+        )
+        for part in rows.reshape(-1, _BATCH)
+    ]
+    cost = np.concatenate(ways)[: len(places)] + _cost_of_truck(places, pile, machine)
+    chosen: np.ndarray = places[int(np.argmin(cost))]
+    return chosen
+
+
+@functools.partial(jax.jit, static_argnames="machine")
+def _mean_ways(
+    places: Float[Array, "n 3"], poses: Float[Array, "n m 3"], room: Room, machine: WheelLoader
+) -> Float[Array, " n"]:
+    """What the ways from poses to receivers cost in the mean [m]."""
+
+    def one(place: Array, pose: Array) -> Array:
+        length, touching, _ = way_to(Pose(*pose), Receiver(*place), room, machine)
+        return length + _TOUCHING * touching
+
+    each = jax.vmap(jax.vmap(one, in_axes=(None, 0)))(places, poses)
+    return each.mean(axis=1)
+
+
+def truck_cells(
+    place: Float[np.ndarray, "... 3"], machine: WheelLoader
+) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n"]]:
+    """X and y of points all over the truck that belongs to receivers [m]."""
+    near, far, half = truck_outline(machine)
+    ahead, left = (
+        a.ravel()
+        for a in np.meshgrid(np.linspace(near, far, 7), np.linspace(-half, half, 15), indexing="ij")
+    )
+    x, y, heading = (place[..., k, None] for k in range(3))
+    return (
+        x + ahead * np.cos(heading) - left * np.sin(heading),
+        y + ahead * np.sin(heading) + left * np.cos(heading),
+    )
+
+
+def _cost_of_truck(
+    places: Float[np.ndarray, "n 3"], pile: Pile, machine: WheelLoader
+) -> Float[np.ndarray, " n"]:
+    """What it costs that a truck stands on something or on unseen ground [m]."""
+    blocked = np.asarray(pile.height - pile.floor) > CLEARED
+    on, unseen = truck_stands_on(places, pile, blocked | standing(pile), machine)
+    cost: np.ndarray = _TRUCK_ON * on + _TRUCK_UNSEEN * unseen
+    return cost
+
+
+def truck_stands_on(
+    place: Float[np.ndarray, "... 3"],
+    pile: Pile,
+    blocked: Bool[np.ndarray, "nx ny"],
+    machine: WheelLoader,
+) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+    """Which part of the truck of receivers stands on blocked cells, and which on unseen ground."""
+    x, y = truck_cells(place, machine)
+    origin, shape = np.asarray(pile.origin, float), pile.height.shape
+    i, j = (np.rint((v - origin[k]) / pile.cell_size) for k, v in enumerate((x, y)))
+    inside = (i >= 0) & (j >= 0) & (i < shape[0]) & (j < shape[1])
+    i, j = (np.clip(v, 0, n - 1).astype(int) for v, n in zip((i, j), shape, strict=True))
+    seen = inside if pile.valid is None else inside & np.asarray(pile.valid)[i, j]
+    return (inside & blocked[i, j]).mean(axis=-1), 1.0 - seen.mean(axis=-1)

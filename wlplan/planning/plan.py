@@ -74,12 +74,12 @@ def plan_loads(
     """
     if loads < 1:
         raise InputError(f"{loads} loads were asked for: ask for at least 1.")
-    job = with_toe(make_job(world, pile, site=site, objective=objective), contour)
+    job = with_toe(make_job(world, pile, site=site, objective=objective, contour=contour), contour)
     chosen = planner_of(planner, job.world)
     proposals = chosen.propose(job, loads, seed=seed, progress=progress)
     if referee is None:
         return choose(job, proposals)
-    return choose(job, proposals, referee=make_job(referee, pile, site=site).world)
+    return choose(job, proposals, referee=make_job(referee, pile, site=job.site).world)
 
 
 def planner_of(planner: str | Planner, world: World) -> Planner:

@@ -56,5 +56,15 @@ class CycleWork:
         return (loading.performance.work + loading.transport.work) / self.reference
 
 
-TERMS: dict[str, Term] = {"mass": InverseMass(), "time": CycleTime(), "work": CycleWork()}
+def touching(loading: Loading) -> Float[Array, ""]:
+    """Metres of the way and of the approach lane that lead through what must not be touched."""
+    return loading.transport.touching
+
+
+TERMS: dict[str, Term] = {
+    "mass": InverseMass(),
+    "time": CycleTime(),
+    "work": CycleWork(),
+    "touching": touching,
+}
 """Terms by name."""

@@ -24,6 +24,12 @@ class WheelLoader:
     travel_speed: float = parameter(8.0 / 3.6, 1.0, 5.0, "m/s")
     # Distance from the dig location at which a cycle starts and ends [m]. Paper, section 5.2.
     approach_distance: float = parameter(5.0, MAP_BEHIND, 50.0, "m")
+    # Length of the outline with the bucket on the ground [m]; its width is that of the bucket.
+    # Brochures of the class: 7.3 to 7.6.
+    length: float = parameter(7.5, 2.0, 20.0, "m")
+    # How far the raised bucket reaches over the side of a truck, from the front of that outline
+    # [m]: the tyres stop short of the truck. Estimate from the brochure's side view.
+    overhang: float = parameter(1.3, 0.0, 6.0, "m")
     # Turning radius at the outside of the tyres [m]. Brochure of the class: 5.2 to 5.5.
     turning_radius: float = parameter(5.4, 1.0, 30.0, "m")
     # Tyre friction on firm gravel [1]. Estimate, 0.6 to 0.75 in the literature.

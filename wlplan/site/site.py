@@ -8,10 +8,8 @@ from flax import struct
 
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
-from wlplan.site.presets import check_machine, check_soil
-from wlplan.site.receiver import Receiver, default_receiver
+from wlplan.site.receiver import Receiver
 from wlplan.site.soil import GRAVEL, Soil
-from wlplan.types import Pile
 
 
 @no_type_check
@@ -20,7 +18,7 @@ class Site(struct.PyTreeNode):
 
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
-    receiver: Receiver | None = None  # None: the default place beside whatever pile there is
+    receiver: Receiver | None = None  # None: a place beside whatever pile there is
     frame: Frame = struct.field(pytree_node=False, default=LOCAL)  # that everything here is in
 
     @property
@@ -28,15 +26,3 @@ class Site(struct.PyTreeNode):
         """The receiver of a site that is beside a pile."""
         assert self.receiver is not None, "a site has its receiver once it is beside a pile"
         return self.receiver
-
-    def beside(self, pile: Pile) -> Site:
-        """The site with a receiver: its own, or the default one of a pile.
-
-        Raises:
-            InputError: If soil or machine make no sense.
-        """
-        check_soil(self.soil)
-        check_machine(self.machine)
-        if self.receiver is not None:
-            return self
-        return self.replace(receiver=default_receiver(pile))

@@ -11,13 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
 from wlplan.report.figures.style import INK, PALE, add_arrow
-from wlplan.site.receiver import Receiver
+from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.receiver import Receiver, truck_outline
 
 # How far a truck may stand outside the view of the pile to widen it, as a part of the longer side;
 # one further away becomes an arrow at the border.
 _TRUCK_REACH = 0.75
-# Body of the truck that is drawn [m]: length and width of a small hauler. Only a symbol.
-_TRUCK_SIZE = (7.0, 2.6)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +24,7 @@ class Truck:
     """A truck that stands across the end of the loader's way; corners and points [m]."""
 
     receiver: Receiver
+    machine: WheelLoader = WA320
 
     @property
     def ahead(self) -> Float[np.ndarray, "2"]:
@@ -49,9 +49,10 @@ class Truck:
         return self._box(-0.10, 0.72, 0.84)
 
     def _box(self, shift: float, long: float, wide: float) -> Float[np.ndarray, "4 2"]:
-        length, width = _TRUCK_SIZE
+        near, far, half = truck_outline(self.machine)
+        length, width = 2.0 * half, far - near
         left = np.array([-self.ahead[1], self.ahead[0]])
-        centre = self.way[1] + (0.5 * width + 0.3) * self.ahead + shift * length * left
+        centre = self.way[1] + 0.5 * (near + far) * self.ahead + shift * length * left
         along, across = 0.5 * long * length * left, 0.5 * wide * width * self.ahead
         corners: np.ndarray = centre + np.stack(
             [along + across, along - across, -along - across, across - along]

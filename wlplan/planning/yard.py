@@ -1,0 +1,220 @@
+"""Room to drive: what a loader must not touch, and how deep it would be in it.
+
+What stands still (structures, areas that nothing may drive on) is found once for a job; the soil is
+looked at anew before every loading. Both are kept on coarse cells, as the depth to which a disc of
+the width of the loader is in them, so that a look at one place costs one memory access.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import no_type_check
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float, UInt8
+
+from wlplan.site.machine import WheelLoader
+from wlplan.types import Pile
+from wlplan.xla import floats
+
+CLEARED = 0.25
+"""What stands higher over the floor than this cannot be driven over [m]. Estimate: the belly of a
+loader of the class clears 0.4 m, its tyres climb less when laden."""
+
+# Cells of the yard come in multiples of so many along each side: what is compiled for one pile
+# serves the next.
+_BLOCK = 32
+# Cells of the pile that make one of the yard, along each side: 0.3 m.
+_COARSE = 3
+# A floor steeper than this is none: what rises faster stands on it [degrees].
+_STEEPEST_FLOOR = 15.0
+# How far the floor is looked for under what stands [m]: half the width of a large building.
+_SEARCHED = 12.0
+
+
+@no_type_check
+class Yard(struct.PyTreeNode):
+    """What stands still around a pile, on coarse cells with a border that is free."""
+
+    standing: Bool[Array, "n m"]
+    unseen: Bool[Array, "n m"]  # by the scan
+    origin: Float[Array, "2"]  # centre of cell [0, 0] [m]
+    cell: float = struct.field(pytree_node=False)  # [m]
+    reach: float = struct.field(pytree_node=False)  # radius of the disc [m]
+
+
+def disc_radius(machine: WheelLoader) -> float:
+    """Radius of the discs that cover the outline of a loader, three of them in a row [m]."""
+    return math.hypot(0.5 * machine.bucket_width, machine.length / 6.0)
+
+
+def yard_of(
+    pile: Pile, machine: WheelLoader, closed: Bool[np.ndarray, "nx ny"] | None = None
+) -> Yard:
+    """The yard around a pile.
+
+    Args:
+        pile: The pile; what its ground is of does not change.
+        machine: What drives there.
+        closed: Cells of the pile's grid that nothing may drive on; None: there are none.
+    """
+    reach = disc_radius(machine)
+    cell = pile.cell_size * _COARSE
+    border = _border(reach, cell)
+    stands = standing(pile)
+    if closed is not None:
+        stands = stands | closed
+    unseen = np.zeros_like(stands) if pile.valid is None else ~np.asarray(pile.valid)
+    middle = 0.5 * (_COARSE - 1) * pile.cell_size
+    origin = np.asarray(pile.origin, np.float64) + middle - border * cell
+    width = [(border, border + (-n - 2 * border) % _BLOCK) for n in _any_pooled(stands).shape]
+    return Yard(
+        standing=jnp.asarray(np.pad(_any_pooled(stands), width)),
+        unseen=jnp.asarray(np.pad(_any_pooled(unseen), width, constant_values=True)),
+        origin=floats(origin),
+        cell=cell,
+        reach=reach,
+    )
+
+
+def _border(reach: float, cell: float) -> int:
+    """Cells around the map in which a disc may still touch what is in it."""
+    return math.ceil(reach / cell) + 1
+
+
+def standing(pile: Pile) -> Bool[np.ndarray, "nx ny"]:
+    """Cells whose ground stands higher over the floor around it than can be driven over.
+
+    The floor is the highest surface below the ground that slopes no more than floors do.
+    """
+    ground = np.asarray(pile.floor, np.float64)
+    if np.ptp(ground) <= CLEARED:
+        return np.zeros(ground.shape, bool)
+    step = pile.cell_size * _COARSE
+    low = -_pooled(-ground)
+    slope = math.tan(math.radians(_STEEPEST_FLOOR))
+    for _ in range(math.ceil(_SEARCHED / step)):
+        before = low
+        for (di, dj), apart in _NEIGHBOURS:
+            padded = np.pad(before, 1, mode="edge")
+            shifted = padded[1 + di : 1 + di + low.shape[0], 1 + dj : 1 + dj + low.shape[1]]
+            low = np.minimum(low, shifted + slope * step * apart)
+        if np.array_equal(low, before):
+            break
+    floor = low.repeat(_COARSE, axis=0).repeat(_COARSE, axis=1)
+    floor = floor[: ground.shape[0], : ground.shape[1]]
+    stands: np.ndarray = ground - floor > CLEARED + slope * step
+    return stands
+
+
+_NEIGHBOURS = [
+    ((i, j), math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
+]
+
+
+def _pooled(values: np.ndarray) -> np.ndarray:
+    """Largest value of each coarse cell; the last ones may be cut short."""
+    nx, ny = values.shape
+    grown = np.pad(values, ((0, -nx % _COARSE), (0, -ny % _COARSE)), mode="edge")
+    nx, ny = (n // _COARSE for n in grown.shape)
+    largest: np.ndarray = grown.reshape(nx, _COARSE, ny, _COARSE).max(axis=(1, 3))
+    return largest
+
+
+def _any_pooled(flags: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "n m"]:
+    return _pooled(flags.astype(np.int8)) > 0
+
+
+@no_type_check
+class Depths(struct.PyTreeNode):
+    """How deep a disc at each place would be in what it must not touch."""
+
+    depth: Float[Array, "n m"]  # in parts of its radius: 0 is free, 1 is the middle in it
+    origin: Float[Array, "2"]  # [m]
+    cell: float = struct.field(pytree_node=False)  # [m]
+
+
+def depths(yard: Yard, pile: Pile) -> Depths:
+    """The depths around a pile as it is; without derivatives with respect to its heights."""
+    border = _border(yard.reach, yard.cell)
+    soil = _most(lax.stop_gradient(pile.height - pile.floor))
+    sizes = zip(yard.standing.shape, soil.shape, strict=True)
+    width = [(border, whole - part - border) for whole, part in sizes]
+    blocked = jnp.pad(soil > CLEARED, width) | yard.standing
+    steps = math.ceil(yard.reach / yard.cell)
+    far = yard.reach**2
+    # The exact squared distance to the nearest blocked cell, along one axis after the other.
+    squared = jnp.where(blocked, 0.0, far).astype(soil.dtype)
+    for axis in (0, 1):
+        width = [(steps, steps) if k == axis else (0, 0) for k in (0, 1)]
+        padded = jnp.pad(squared, width, constant_values=far)
+        count = squared.shape[axis]
+        shifted = (
+            lax.slice_in_dim(padded, steps + k, steps + k + count, axis=axis) + (k * yard.cell) ** 2
+            for k in range(-steps, steps + 1)
+        )
+        squared = functools.reduce(jnp.minimum, shifted)
+    depth = jnp.maximum(1.0 - jnp.sqrt(squared) / yard.reach, 0.0)
+    return Depths(depth, yard.origin, yard.cell)
+
+
+def _most(values: Float[Array, "nx ny"]) -> Float[Array, "n m"]:
+    """Largest value of each coarse cell."""
+    nx, ny = values.shape
+    grown = jnp.pad(values, ((0, -nx % _COARSE), (0, -ny % _COARSE)), mode="edge")
+    parts = [grown[i::_COARSE, j::_COARSE] for i in range(_COARSE) for j in range(_COARSE)]
+    return functools.reduce(jnp.maximum, parts)
+
+
+def depth_near(field: Depths, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The depth at the nearest cells; constant in between, free outside the map."""
+    n, m = field.depth.shape
+    i = jnp.clip(((x - field.origin[0]) / field.cell + 0.5).astype(jnp.int32), 0, n - 1)
+    j = jnp.clip(((y - field.origin[1]) / field.cell + 0.5).astype(jnp.int32), 0, m - 1)
+    return field.depth.reshape(-1)[i * m + j]
+
+
+def depth_at(field: Depths, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The depth between the cells, bilinear; free outside the map."""
+    n, m = field.depth.shape
+    u = jnp.clip((x - field.origin[0]) / field.cell, 0.0, n - 1.0)
+    v = jnp.clip((y - field.origin[1]) / field.cell, 0.0, m - 1.0)
+    i = jnp.clip(lax.stop_gradient(u).astype(jnp.int32), 0, n - 2)
+    j = jnp.clip(lax.stop_gradient(v).astype(jnp.int32), 0, m - 2)
+    a, b = u - i, v - j
+    flat, corner = field.depth.reshape(-1), i * m + j
+    low = (1.0 - b) * flat[corner] + b * flat[corner + 1]
+    high = (1.0 - b) * flat[corner + m] + b * flat[corner + m + 1]
+    return (1.0 - a) * low + a * high
+
+
+def is_unseen(yard: Yard, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
+    """Whether places lie where the scan saw nothing, or outside it."""
+    return _flag_near(yard.unseen, yard, x, y)
+
+
+def is_standing(yard: Yard, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
+    """Whether something stands still at places."""
+    return _flag_near(yard.standing, yard, x, y)
+
+
+def _flag_near(flags: Bool[Array, "n m"], yard: Yard, x: Array, y: Array) -> Bool[Array, "*n"]:
+    n, m = flags.shape
+    i = jnp.clip(((x - yard.origin[0]) / yard.cell + 0.5).astype(jnp.int32), 0, n - 1)
+    j = jnp.clip(((y - yard.origin[1]) / yard.cell + 0.5).astype(jnp.int32), 0, m - 1)
+    return flags.reshape(-1)[i * m + j]
+
+
+def packed_soil(pile: Pile) -> UInt8[Array, " bytes"]:
+    """Cells with more soil than can be driven over, eight to a byte."""
+    return jnp.packbits((pile.height - pile.floor > CLEARED).reshape(-1))
+
+
+def unpacked_soil(packed: UInt8[np.ndarray, " bytes"], shape: tuple[int, ...]) -> np.ndarray:
+    """The inverse of `packed_soil`: bool, as the grid of the pile."""
+    cells: np.ndarray = np.unpackbits(np.asarray(packed), count=math.prod(shape)).astype(bool)
+    return cells.reshape(shape)
