@@ -108,8 +108,14 @@ def crop(scan: Scan, box: Box) -> Scan:
     if isinstance(scan, PointCloud):
         if np.ndim(scan.points) != 2 or not len(scan.points):
             return scan
-        places = np.concatenate([scan.coordinates(part)[:, :2] for part in scan.parts()])
-        return dataclasses.replace(scan, points=scan.points[points_inside(places, box)])
+        inside = np.concatenate(
+            [points_inside(scan.coordinates(part), box) for part in scan.parts()]
+        )
+        if not inside.any():
+            ends = [_ends(scan.coordinates(part)) for part in scan.parts()]
+            low, high = np.array(ends)[:, 0].min(axis=0), np.array(ends)[:, 1].max(axis=0)
+            raise nothing_inside(low, high)
+        return dataclasses.replace(scan, points=scan.points[inside])
     low, high = corners(box)
     origin, sides = np.asarray(scan.origin, np.float64), np.array(scan.height.shape[:2])
     first = np.clip(np.ceil((low - origin) / scan.cell_size), 0, sides).astype(int)
@@ -124,16 +130,19 @@ def crop(scan: Scan, box: Box) -> Scan:
     return dataclasses.replace(scan, origin=origin + first * scan.cell_size, **maps)
 
 
-def points_inside(points: np.ndarray, box: Box) -> np.ndarray:
-    """Which points, shape [n, 2] or [n, 3], lie inside a rectangle, shape [n].
+def _ends(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest finite x, y and z; infinite, the wrong way round, where none is."""
+    finite = np.isfinite(places)
+    return (
+        np.where(finite, places, np.inf).min(axis=0),
+        np.where(finite, places, -np.inf).max(axis=0),
+    )
 
-    Raises:
-        InputError: If none does.
-    """
+
+def points_inside(points: np.ndarray, box: Box) -> np.ndarray:
+    """Which points, shape [n, 2] or [n, 3], lie inside a rectangle, shape [n]."""
     (low, high), places = corners(box), points[:, :2]
     inside: np.ndarray = np.asarray(((places >= low) & (places <= high)).all(axis=-1))
-    if not inside.any():
-        raise nothing_inside(np.nanmin(places, axis=0), np.nanmax(places, axis=0))
     return inside
 
 
