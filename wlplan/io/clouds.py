@@ -19,6 +19,7 @@ from wlplan.constants import CELL_SIZE
 from wlplan.errors import InputError
 from wlplan.io.overview import coarse_cell, where_piles_are
 from wlplan.io.scans import Heightmap, PointCloud, check_size, real_numbers
+from wlplan.io.sensor import NEAR, at_sensor
 from wlplan.terrain.floor import fill_unseen
 
 # A point cloud is gridded at this many times its mean spacing where that is more than a cell: two
@@ -40,10 +41,6 @@ _PATCH, _LAYERS, _LOWER, _FEW = 5, 1.0, 0.2, 3
 _ROUNDED, _HARMLESS, _REGULAR = 3.0, 0.25, 0.1
 # More lines than this lie closer together than either.
 _MOST_LINES = 4_000_000
-# Balls round the sensor [m], and how far away the nearest surface then is at least [m]: what is in
-# the ball, if it is this many points, is the sensor itself or what it stands on. The part of them
-# that may lie between is noise.
-_BALLS, _APART, _CLUMP, _BETWEEN = (1.0, 0.5, 0.25), 0.5, 10, 0.02
 
 
 def grid_points(cloud: PointCloud) -> Heightmap:
@@ -96,41 +93,19 @@ def _kept_parts(
 
 
 def _usable(cloud: PointCloud) -> tuple[Bool[np.ndarray, " n"], tuple[str, ...]]:
-    """Points that are finite and not at the place of the sensor, and notes of those that are.
-
-    A return without a range is a point at zero, and a scanner sees itself there, while the nearest
-    surface is some way off.
-    """
+    """Points that are finite and not at the place of the sensor, and notes of those that are."""
     kept = np.ones(len(cloud.points), bool)
-    near_rows, near = [], []
+    rows, near = [np.empty(0, np.int64)], [np.empty((0, 3))]
     for part in cloud.parts():
         places = cloud.coordinates(part)
-        finite = np.isfinite(places).all(axis=-1)
-        kept[part] = finite
-        with np.errstate(over="ignore", invalid="ignore"):
-            distance = np.sqrt((places**2).sum(axis=-1))
-        close = np.flatnonzero(distance < max(_BALLS) + _APART)
-        near_rows.append(close + part.start)
-        near.append(distance[close])
-    notes = []
-    rows = np.concatenate([np.empty(0, int), *near_rows])
-    distances = np.concatenate([np.empty(0), *near])
-    zero = distances == 0.0
-    if zero.sum() > 1:
-        kept[rows[zero]] = False
-        notes.append(f"left out {int(zero.sum())} points at 0,0,0: returns without a range")
-    for radius in _BALLS:
-        ball = ~zero & (distances < radius)
-        between = ~zero & ~ball & (distances < radius + _APART)
-        count = int(ball.sum())
-        if count >= _CLUMP and between.sum() <= _BETWEEN * count and 2 * count < kept.sum():
-            kept[rows[ball]] = False
-            notes.append(
-                f"left out {count} points within {radius:g} m of 0,0,0, apart from all others: "
-                f"the scanner itself"
-            )
-            break
-    return kept, tuple(notes)
+        kept[part] = np.isfinite(places).all(axis=-1)
+        close = np.flatnonzero((np.abs(places) < NEAR).all(axis=-1))
+        rows.append(close + part.start)
+        near.append(places[close])
+    found = np.concatenate(rows)
+    out, notes = at_sensor(np.concatenate(near), int(kept.sum()) - len(found))
+    kept[found[out]] = False
+    return kept, notes
 
 
 def _span(
@@ -160,7 +135,8 @@ class _Tiles:
 
     def places(self) -> np.ndarray:
         """Number of each square along x and along y, shape [t, 2]."""
-        return np.stack([self.key >> 32, self.key & 0xFFFFFFFF], axis=-1)
+        both: np.ndarray = np.stack([self.key >> 32, self.key & 0xFFFFFFFF], axis=-1)
+        return both
 
     def doubled(self) -> _Tiles:
         """The same in squares of twice the side."""
@@ -180,7 +156,8 @@ def _key(
 ) -> Int[np.ndarray, " m"]:
     """Key of the square that each point lies in."""
     i, j = np.floor((places[:, :2] - low) / side).astype(np.int64).T
-    return (i << 32) + j
+    key: np.ndarray = (i << 32) + j
+    return key
 
 
 def _together(cloud: PointCloud, kept: Bool[np.ndarray, " n"]) -> tuple[float, tuple[str, ...]]:

@@ -73,3 +73,19 @@ def where_piles_are(
     if not words:
         return ""
     return f"; there is a pile around {', one around '.join(words)}"
+
+
+def averaged(
+    height: Float[np.ndarray, "nx ny"], seen: Bool[np.ndarray, "nx ny"], times: int
+) -> tuple[Float[np.ndarray, "mx my"], Bool[np.ndarray, "mx my"]]:
+    """Means over squares of so many cells a side, and which of them hold a cell that was seen."""
+    nx, ny = (n // times for n in height.shape)
+
+    def total(cells: Float[np.ndarray, "nx ny"]) -> Float[np.ndarray, "mx my"]:
+        sums: np.ndarray = (
+            cells[: nx * times, : ny * times].reshape(nx, times, ny, times).sum(axis=(1, 3))
+        )
+        return sums
+
+    count = total(seen.astype(float))
+    return total(np.where(seen, height, 0.0)) / np.maximum(count, 1.0), count > 0
