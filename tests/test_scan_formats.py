@@ -245,6 +245,31 @@ def test_a_mesh_does_not_fetch_other_files(tmp_path: Path, monkeypatch: pytest.M
     assert secret.stat().st_atime_ns == before
 
 
+def test_the_many_ways_to_write_a_face(tmp_path: Path) -> None:
+    """Squares, indices from the end, textures and normals, groups; names in another encoding."""
+    x, y = (np.arange(0.0, side + 0.1, 0.5) for side in scene.SIDES)
+    height = scene.yard(x[:, np.newaxis], y)
+    lines = [f"v {a} {b} {height[i, j]:.4f}" for i, a in enumerate(x) for j, b in enumerate(y)]
+    n, total = len(y), height.size
+    lines += ["vt 0 0", "vn 0 0 1", "o Stra\xdfe"]
+    for i in range(len(x) - 1):
+        lines += [f"g row{i}"] if i % 10 == 0 else []
+        for j in range(n - 1):
+            corners = [i * n + j, i * n + n + j, i * n + n + j + 1, i * n + j + 1]
+            named = [
+                f"{k - total}//-1" if i % 3 == 0 else f"{k + 1}/1/1" if i % 3 == 1 else f"{k + 1}"
+                for k in corners
+            ]
+            lines.append(f"f {' '.join(named)}")
+    path = tmp_path / "a.obj"
+    path.write_bytes("\n".join(lines).encode("latin-1"))
+    scan = scene.check_file(path, cone=0.11)
+    assert scan.pile.valid is None
+    path = scene.write_stl(tmp_path / "a.stl", scene.triangles())
+    path.write_bytes(path.read_bytes() + b"\0")
+    refused(path, "or no STL file")
+
+
 def test_an_obj_without_faces_is_a_point_cloud(tmp_path: Path) -> None:
     rows = scene.points()
     scene.check_file(

@@ -24,6 +24,8 @@ from wlplan.io.upright import check_upright, turned, turning, up_axis, upright
 ENDINGS = (".obj", ".stl")
 OPTIONS = ("up", "crop")
 
+# Bytes before the faces of a binary STL, which end with their number, and of a face.
+_STL_HEAD, _STL_FACE = 84, 50
 # Points on the faces that show which way is up, and the seed of their places.
 _SOME, _SEED = 50_000, 0
 
@@ -39,8 +41,8 @@ def read(path: Path, *, up: str | None = None, crop: Box | None = None) -> Heigh
     Raises:
         InputError: If trimesh is missing, there are no faces, or it is not clear which way is up.
     """
-    content = path.read_bytes()
     kind = path.suffix.lower().removeprefix(".")
+    content = _content(path.read_bytes(), kind)
     _, _, notes = Reference().factors()
     with library("trimesh", install="wlplan[scan]") as trimesh:
         load = trimesh.exchange.load.mesh_loaders[kind]
@@ -71,6 +73,17 @@ def read(path: Path, *, up: str | None = None, crop: Box | None = None) -> Heigh
 
     height, seen, cell, origin = upper_surface(triangles, crop)
     return Heightmap(height, cell, origin, None if seen.all() else seen, notes=notes)
+
+
+def _content(content: bytes, kind: str) -> bytes:
+    """What the library is given: text in UTF-8, whatever its names and remarks are written in."""
+    if kind == "stl" and len(content) >= _STL_HEAD:
+        count = int.from_bytes(content[_STL_HEAD - 4 : _STL_HEAD], "little")
+        if len(content) == _STL_HEAD + count * _STL_FACE:
+            return content
+    if kind == "stl" and not content.lstrip()[:5].lower() == b"solid":
+        raise InputError("is damaged or cut short, or no STL file: copy or export it again.")
+    return content.decode("utf-8", "replace").encode()
 
 
 def _faces(part: dict[str, Any]) -> bool:
