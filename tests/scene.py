@@ -45,7 +45,10 @@ def grid(cell: float = 0.2) -> np.ndarray:
 def triangles() -> np.ndarray:
     """The yard in large faces and small ones; the floor goes on below the cones."""
     (w, h), rim = SIDES, np.linspace(0.0, 2.0 * math.pi, 73)
-    faces = [[(0, 0, 0), (w, 0, 0), (w, h, 0)], [(0, 0, 0), (w, h, 0), (0, h, 0)]]
+    faces = [
+        [(0.0, 0.0, 0.0), (w, 0.0, 0.0), (w, h, 0.0)],
+        [(0.0, 0.0, 0.0), (w, h, 0.0), (0.0, h, 0.0)],
+    ]
     for (a, b), top in (CONE, MOUND):
         ring = [(a + top / SLOPE * math.cos(t), b + top / SLOPE * math.sin(t), 0.0) for t in rim]
         faces += [[(a, b, top), one, two] for one, two in itertools.pairwise(ring)]

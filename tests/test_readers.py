@@ -253,14 +253,23 @@ def test_damaged_point_clouds_are_refused_or_read_but_never_crash(
     check_damage(write(tmp_path / f"pile{ending}", points), capfd)
 
 
-@pytest.mark.parametrize(("ending", "module"), [(".tif", "rasterio"), (".laz", "laspy")])
+@pytest.mark.parametrize(
+    ("ending", "content", "module"),
+    [
+        (".tif", b"II*\0", "rasterio"),
+        (".laz", b"x", "laspy"),
+        (".e57", b"x", "pye57"),
+        (".stl", b"solid", "trimesh"),
+        (".mcap", b"\x89MCAP0\r\n", "rosbags"),
+    ],
+)
 def test_a_missing_reader_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, module: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, content: bytes, module: str
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     path = tmp_path / f"pile{ending}"
-    path.write_bytes(b"x")
-    refused(path, r"pip install wlplan\[scan\]")
+    path.write_bytes(content)
+    refused(path, rf"needs {module}, .*pip install (wlplan\[scan\]|pye57)`")
 
 
 # --- the readers themselves

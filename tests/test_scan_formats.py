@@ -417,6 +417,44 @@ def test_grid_maps_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
     refused(path.rename(tmp_path / "what?.db3"), "in its path: rename it")
 
 
+def test_a_recording_that_is_sound_is_not_called_damaged(tmp_path: Path) -> None:
+    bag = scene.write_bag(tmp_path / "a.bag", {"elevation": scene.grid()})
+    content = bag.read_bytes()
+    start = content.index(b"index_pos=") + len(b"index_pos=")
+    bag.write_bytes(content[:start] + bytes(8) + content[start + 8 :])
+    assert "damaged" not in refused(bag, "no index: run `rosbag reindex`")
+    mcap = scene.write_bag(tmp_path / "a.mcap", {"elevation": scene.grid()})
+    mcap.write_bytes(mcap.read_bytes().replace(b"ros2", b"ros1", 1))
+    assert "damaged" not in refused(mcap, "no MCAP of ROS 2")
+
+
+# --- files that are sound, but of another kind
+
+
+@pytest.mark.parametrize("ending", known_endings())
+def test_files_with_the_wrong_ending_are_not_called_damaged(tmp_path: Path, ending: str) -> None:
+    """A picture, and a page of text; but a .las and a .e57 may be either."""
+    for content in (b"\x89PNG\r\n\x1a\n" + bytes(500), b"Dear all,\nthe scan will follow.\n"):
+        (tmp_path / f"a{ending}").write_bytes(content)
+        said = refused(tmp_path / f"a{ending}", "a")
+        assert "damaged" not in said or ", or no " in said
+
+
+def test_a_file_of_objects_is_not_called_damaged(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", height=np.array([[1, "b"]], object), cell_size=0.1)
+    assert "damaged" not in refused(tmp_path / "a.npz", "Python objects: save plain arrays")
+
+
+def test_a_system_that_is_not_understood_is_no_reason_to_refuse() -> None:
+    from wlplan.io.readers import e57
+
+    assert e57._system("", (0.0, 0.0)) == (None, [])
+    assert e57._system("EPSG:25832", (5e5, 5e6)) == ("EPSG:25832", [])
+    assert e57._system("Site grid of Smith & Sons", (0.0, 0.0))[0] is None
+    with pytest.raises(InputError, match="degrees"):
+        e57._system("EPSG:4326", (9.0, 48.0))
+
+
 # --- a known floor
 
 
@@ -448,6 +486,7 @@ def test_where_the_floor_was_not_scanned_it_is_estimated(tmp_path: Path) -> None
     np.testing.assert_allclose(floor[:118], -0.5, atol=1e-6)
     np.testing.assert_allclose(floor[122:], 0.0, atol=0.05)
     assert "known under 50 % of the scan" in scan.notes[1]
+    assert scan.notes[2] == f"of the floor: {NO_UNIT}"
 
 
 def test_a_floor_of_another_place_or_height_is_refused(

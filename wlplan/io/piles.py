@@ -267,6 +267,7 @@ def _to_pile(
         place, known_scan = floor
         with named(place):
             floor, notes = floor_of(known_scan, height, valid, scan.cell_size, origin)
+        notes += tuple(f"of the floor: {note}" for note in known_scan.notes)
         known_floor = np.isfinite(floor)
         floor = np.where(known_floor, floor, height)
     if isinstance(floor, float | int):

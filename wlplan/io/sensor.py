@@ -9,6 +9,9 @@ import numpy as np
 # that may lie between is noise.
 _BALLS, _APART, _CLUMP, _BETWEEN = (1.0, 0.5, 0.25), 0.5, 10, 0.02
 
+# Zero, as integers times a scale plus an offset may miss it [m].
+_ZERO = 1e-6
+
 NEAR = max(_BALLS) + _APART
 """Distance from the sensor beyond which points play no role [m]."""
 
@@ -25,7 +28,7 @@ def at_sensor(places: np.ndarray, others: int = 0) -> tuple[np.ndarray, tuple[st
     """
     with np.errstate(over="ignore", invalid="ignore"):
         distance = np.sqrt((places**2).sum(axis=-1))
-    zero = distance == 0.0
+    zero = distance < _ZERO
     out = np.zeros(len(places), bool)
     notes = []
     # One may be the corner of a grid.

@@ -73,8 +73,21 @@ def read(path: Path, *, crop: Box | None = None) -> PointCloud:
         notes.insert(0, f"{scans} scans joined")
     # Lengths are in metres, whatever the system: ASTM E2807-11, 8.1.
     middle = np.nanmedian(points[:: len(points) // _SOME + 1], axis=0)
-    system = reference_of(definition, (middle[0], middle[1])).name if definition else None
+    system, unknown = _system(definition, (float(middle[0]), float(middle[1])))
+    notes += unknown
     return PointCloud(points, crs=system, notes=tuple(notes))
+
+
+def _system(definition: str, middle: tuple[float, float]) -> tuple[str | None, list[str]]:
+    """Name of a reference system, and a note of one that is not understood: it need not be one."""
+    if not definition:
+        return None, []
+    try:
+        return reference_of(definition, middle).name, []
+    except InputError as error:
+        if error.__cause__ is None:
+            raise
+        return None, ["the file names a reference system that is not understood"]
 
 
 def _points(pye57: Any, file: Any, header: Any) -> Iterator[np.ndarray]:

@@ -24,6 +24,8 @@ from wlplan.io.scans import Box, Heightmap, check_size, corners, nothing_inside
 ENDINGS = (".tif", ".tiff")
 OPTIONS = ("band", "crop")
 
+# How TIFF and BigTIFF begin, in either order of bytes.
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # What bands of heights are called.
 _HEIGHTS = re.compile(r"height|elev|altitude|\b(dsm|dtm|dem|dgm|dom|z)\b", re.IGNORECASE)
 _COLOURS = {"red", "green", "blue", "palette", "hue", "saturation", "lightness", "cyan", "magenta"}
@@ -45,6 +47,9 @@ def read(path: Path, *, band: int | None = None, crop: Box | None = None) -> Hei
         InputError: If rasterio or pyproj is missing, the band is not clear or a colour, the cells
             are not square and along the axes, or the coordinates are no lengths on the ground.
     """
+    with path.open("rb") as start:
+        if start.read(4) not in _TIFF:
+            raise InputError("is no TIFF file: give it the ending of its format.")
     # A whole path and one driver: nothing else is opened than that file, whatever its name looks
     # like.
     place = path.absolute()

@@ -7,6 +7,7 @@ Messages are taken apart by the definitions of grid_map_msgs below, never by tho
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from wlplan.io.scans import Heightmap, check_size
 ENDINGS = (".bag", ".mcap", ".db3")
 OPTIONS = ("layer",)
 
+_BEGINS = {".bag": b"#ROSBAG V", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
 _TYPE = "grid_map_msgs/msg/GridMap"
 _ELEVATION = "elevation"
 # Source: grid_map, grid_map_msgs/msg, its branches for ROS 1 and 2, which differ in where the
@@ -45,6 +47,9 @@ def read(path: Path, *, layer: str | None = None) -> Heightmap:
         InputError: If rosbags is missing, there is no such map or layer, or the map is turned
             against its frame.
     """
+    with path.open("rb") as file:
+        if not file.read(16).startswith(_BEGINS[path.suffix.lower()]):
+            raise InputError("is no recording of ROS: give it the ending of its format.")
     with library("rosbags", install="wlplan[scan]"):
         message, notes = _last_map(path)
     names = list(message.layers)
@@ -104,7 +109,15 @@ def _messages(path: Path, ros1: bool) -> Iterator[tuple[str, int, bytes]]:
         # SQLite is given its place as a URI, in which these mean something.
         raise InputError("has one of ?, # and % in its path: rename it.")
     reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
-    with reader:
+    try:
+        reader.open()
+    except (rosbag1.ReaderError, rosbag2.ReaderError) as error:
+        if "Profile is not" in str(error):
+            raise InputError("is no MCAP of ROS 2: record it there.") from error
+        if "not indexed" in str(error):
+            raise InputError("has no index: run `rosbag reindex` with it.") from error
+        raise
+    with contextlib.closing(reader):
         ours = [c for c in reader.connections if c.msgtype == _TYPE]
         # None at all would mean every one.
         if ours:
