@@ -570,6 +570,34 @@ def test_a_flat_site_that_is_too_large_names_none(tmp_path: Path) -> None:
     assert refused(tmp_path / "a.npz", "4000 cells").endswith("or check the units.")
 
 
+@pytest.mark.parametrize("ending", [".ply", ".las", ".laz"])
+def test_many_points_are_read_in_parts_as_in_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
+) -> None:
+    """With strays, a roof and a hole, so that every step has something to do."""
+    from wlplan.io import scans
+    from wlplan.io.readers import las
+
+    random = np.random.default_rng(3)
+    rows = scene.points(120.0)
+    rows = rows[np.hypot(rows[:, 0] - 3.0, rows[:, 1] - 3.0) > 1.0]
+    roof = scene.points(30.0, seed=2) * [0.2, 1.0, 0.0] + [14.0, 0.0, 7.0]
+    strays = random.uniform(100.0, 200.0, (9, 3))
+    rows = random.permutation(np.concatenate([rows, roof, strays]))
+    path = tmp_path / f"a{ending}"
+    write = write_ply if ending == ".ply" else write_las
+    write(path, rows)
+    crop = (-1.0, -1.0, 23.0, 250.0)
+    whole, part = read_scan(path), read_scan(path, crop=crop)
+    assert sum("left out 9 of" in note or "hang over" in note for note in whole.notes) == 2
+    monkeypatch.setattr(scans, "_AT_ONCE", 997)
+    monkeypatch.setattr(las, "_AT_ONCE", 1009)
+    for one, again in ((whole, read_scan(path)), (part, read_scan(path, crop=crop))):
+        np.testing.assert_array_equal(again.pile.height, one.pile.height)
+        np.testing.assert_array_equal(again.pile.valid, one.pile.valid)
+        assert again.notes == one.notes
+
+
 # --- the command line
 
 
