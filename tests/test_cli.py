@@ -19,6 +19,7 @@ from pages import Page
 
 from wlplan import cli, dataset, io
 from wlplan.errors import InputError
+from wlplan.io.upright import TURNS
 from wlplan.planning import objective
 from wlplan.planning import plan as planner
 from wlplan.planning.job import PlanResult
@@ -777,6 +778,7 @@ def test_no_command_shows_the_help(run: Run) -> None:
 
 def test_the_names_offered_are_those_that_exist() -> None:
     assert cli.options.PROTOCOLS == dataset.PROTOCOLS
+    assert set(cli.options.UPS) == set(TURNS)
 
 
 def test_the_report_stands_alone_and_escapes_names(run: Run, tmp_path: Path) -> None:

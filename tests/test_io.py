@@ -172,7 +172,7 @@ def nan_in(name: str) -> Change:
         (setting("height", np.zeros((4001, 41), np.int8)), "may have 4000 cells"),
         (setting("height", np.zeros((50, 50), complex)), "real numbers"),
         (setting("height", np.full((50, 50), "a")), "real numbers"),
-        (setting("height", np.full((50, 50), None)), "cannot be read"),  # would need pickle
+        (setting("height", np.full((50, 50), None)), "Python objects"),  # would need pickle
         (setting("height", np.full((50, 50), np.inf)), "2500 cells that count as seen"),
         (setting("valid", np.ones((5, 5), bool)), "`valid` has shape"),
         (setting("valid", np.full((111, 111), 7)), "`valid`"),
@@ -213,7 +213,7 @@ def test_missing_files_folders_and_strange_names_are_refused(tmp_path: Path) -> 
     (tmp_path / "folder.npz").mkdir()
     refused(tmp_path / "folder.npz", "is a folder")
     refused(tmp_path / ("n" * 300 + ".npz"), "no such pile file")
-    for name in ("pile.txt", "pile"):
+    for name in ("pile.doc", "pile"):
         (tmp_path / name).write_text("x")
         refused(tmp_path / name, "unknown kind of pile file")
 

@@ -253,14 +253,23 @@ def test_damaged_point_clouds_are_refused_or_read_but_never_crash(
     check_damage(write(tmp_path / f"pile{ending}", points), capfd)
 
 
-@pytest.mark.parametrize(("ending", "module"), [(".tif", "rasterio"), (".laz", "laspy")])
+@pytest.mark.parametrize(
+    ("ending", "content", "module"),
+    [
+        (".tif", b"II*\0", "rasterio"),
+        (".laz", b"x", "laspy"),
+        (".e57", b"x", "pye57"),
+        (".stl", b"solid", "trimesh"),
+        (".mcap", b"\x89MCAP0\r\n", "rosbags"),
+    ],
+)
 def test_a_missing_reader_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, module: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, content: bytes, module: str
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     path = tmp_path / f"pile{ending}"
-    path.write_bytes(b"x")
-    refused(path, r"pip install wlplan\[scan\]")
+    path.write_bytes(content)
+    refused(path, rf"needs {module}, .*pip install (wlplan\[scan\]|pye57)`")
 
 
 # --- the readers themselves
@@ -284,7 +293,7 @@ def in_a_process(code: str, path: Path) -> str:
 def test_every_reader_declares_its_endings_and_no_two_the_same() -> None:
     modules = [importlib.import_module(f"wlplan.io.readers.{name}") for name in MODULES]
     endings = [ending for module in modules for ending in module.ENDINGS]
-    assert len(modules) >= 4
+    assert len(modules) >= 9
     assert all(module.__doc__ and all(module.ENDINGS) for module in modules)
     assert all(re.fullmatch(r"\.[a-z0-9]+", ending) for ending in endings)
     assert len(endings) == len(set(endings))
@@ -310,14 +319,14 @@ def test_endings_are_told_without_the_libraries_of_the_formats_or_jax(tmp_path: 
 
 
 @pytest.fixture
-def xyz(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def pts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The example of the documentation as a module that can be imported, its name on the path."""
     folder = tmp_path / "theirs"
     folder.mkdir()
-    (folder / "their_xyz.py").write_text(EXAMPLE)
+    (folder / "their_pts.py").write_text(EXAMPLE)
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setattr(readers, "_registered", {})
-    monkeypatch.delitem(sys.modules, "their_xyz", raising=False)
+    monkeypatch.delitem(sys.modules, "their_pts", raising=False)
     return folder
 
 
@@ -330,61 +339,61 @@ def offer(folder: Path, package: str, *lines: str) -> None:
     (info / "entry_points.txt").write_text(text)
 
 
-def write_xyz(path: Path, points: np.ndarray) -> Path:
-    np.savetxt(path, points, "%.4f", header="x y z", comments="# ")
+def write_pts(path: Path, points: np.ndarray) -> Path:
+    np.savetxt(path, points, "%.4f", header=f"{len(points)}", comments="")
     return path
 
 
 def test_the_documented_reader_reads_a_cloud_once_it_is_registered(
-    tmp_path: Path, pile: Pile, xyz: Path
+    tmp_path: Path, pile: Pile, pts: Path
 ) -> None:
     points = points_of(pile, np.random.default_rng(0), 20_000)
-    path = write_xyz(tmp_path / "pile.xyz", points)
-    refused(path, r"unknown kind of pile file '\.xyz'")
-    module = importlib.import_module("their_xyz")
+    path = write_pts(tmp_path / "pile.pts", points)
+    refused(path, r"unknown kind of pile file '\.pts'")
+    module = importlib.import_module("their_pts")
     register_reader(module)
     register_reader(module)  # nothing new
-    assert ".xyz" in known_endings()
+    assert ".pts" in known_endings()
     want = io.read_pile(write_ply(tmp_path / "pile.ply", np.round(points, 4)))
     np.testing.assert_allclose(io.read_pile(path).height, want.height, atol=1e-3)
-    path.write_text("1 2\n3 4\n")
-    refused(path, "fewer than three numbers")
+    path.write_text("2\n1 2\n3 4\n")
+    refused(path, "not the points that it counts")
     path.write_text("one two three\n")
-    refused(path, r"cannot be read as \.xyz")
+    refused(path, r"cannot be read as \.pts")
 
 
-def test_the_documented_reader_comes_with_a_package(tmp_path: Path, pile: Pile, xyz: Path) -> None:
-    offer(xyz, "theirs", "xyz = their_xyz")
-    path = write_xyz(tmp_path / "pile.xyz", points_of(pile, np.random.default_rng(0), 2000))
-    assert ".xyz" in known_endings()
-    assert "their_xyz" not in sys.modules  # only loaded for a file of its own
+def test_the_documented_reader_comes_with_a_package(tmp_path: Path, pile: Pile, pts: Path) -> None:
+    offer(pts, "theirs", "pts = their_pts")
+    path = write_pts(tmp_path / "pile.pts", points_of(pile, np.random.default_rng(0), 2000))
+    assert ".pts" in known_endings()
+    assert "their_pts" not in sys.modules  # only loaded for a file of its own
     assert np.isfinite(io.read_pile(path).height).all()
     check = f"from wlplan.cli import inputs; inputs.check_pile_name({str(path)!r})"
-    assert in_a_process(f"{check}; print('jax' in sys.modules)", xyz) == "False"
+    assert in_a_process(f"{check}; print('jax' in sys.modules)", pts) == "False"
 
 
 @pytest.mark.parametrize(
     ("lines", "match"),
     [
-        (["xyz = no_such_module"], "no_such_module, which reads .xyz, cannot be used .*No module"),
-        (["xyz = math"], "math is no reader"),
-        (["xyz = their_xyz:ENDINGS"], "tuple is no reader"),
+        (["pts = no_such_module"], "no_such_module, which reads .pts, cannot be used .*No module"),
+        (["pts = math"], "math is no reader"),
+        (["pts = their_pts:ENDINGS"], "tuple is no reader"),
     ],
 )
 def test_a_package_with_a_broken_reader_is_named(
-    tmp_path: Path, fields: dict[str, Any], xyz: Path, lines: list[str], match: str
+    tmp_path: Path, fields: dict[str, Any], pts: Path, lines: list[str], match: str
 ) -> None:
-    offer(xyz, "theirs", *lines)
-    (tmp_path / "pile.xyz").write_text("1 2 3")
-    refused(tmp_path / "pile.xyz", match)
+    offer(pts, "theirs", *lines)
+    (tmp_path / "pile.pts").write_text("1 2 3")
+    refused(tmp_path / "pile.pts", match)
     io.read_pile(save(tmp_path / "pile.npz", fields))  # all others are read as ever
 
 
-def test_two_packages_for_one_ending_are_refused(tmp_path: Path, xyz: Path) -> None:
-    offer(xyz, "theirs", "xyz = their_xyz")
-    offer(xyz, "others", "XYZ = others_xyz")
-    (tmp_path / "pile.xyz").write_text("1 2 3")
-    refused(tmp_path / "pile.xyz", "others_xyz and their_xyz both read .xyz")
+def test_two_packages_for_one_ending_are_refused(tmp_path: Path, pts: Path) -> None:
+    offer(pts, "theirs", "pts = their_pts")
+    offer(pts, "others", "PTS = others_pts")
+    (tmp_path / "pile.pts").write_text("1 2 3")
+    refused(tmp_path / "pile.pts", "others_pts and their_pts both read .pts")
 
 
 def reader(*endings: object, read: object = lambda path: None, **names: Any) -> SimpleNamespace:
@@ -394,14 +403,14 @@ def reader(*endings: object, read: object = lambda path: None, **names: Any) -> 
 @pytest.mark.parametrize(
     ("candidate", "match"),
     [
-        (reader(".xyz", read=3), "mine is no reader"),
+        (reader(".pts", read=3), "mine is no reader"),
         (reader(), "`ENDINGS`"),
-        (reader("xyz"), "`ENDINGS`"),
-        (reader(".XYZ"), "`ENDINGS`"),
-        (reader(".xyz", ".a.b"), "`ENDINGS`"),
-        (reader(".xyz", 3), "`ENDINGS`"),
-        (SimpleNamespace(ENDINGS=".xyz", read=len), "`ENDINGS`"),
-        (reader(".xyz", ".ply"), r"mine reads \.ply, as wlplan\.io\.readers\.ply does already"),
+        (reader("pts"), "`ENDINGS`"),
+        (reader(".PTS"), "`ENDINGS`"),
+        (reader(".pts", ".a.b"), "`ENDINGS`"),
+        (reader(".pts", 3), "`ENDINGS`"),
+        (SimpleNamespace(ENDINGS=".pts", read=len), "`ENDINGS`"),
+        (reader(".pts", ".ply"), r"mine reads \.ply, as wlplan\.io\.readers\.ply does already"),
     ],
 )
 def test_what_is_no_reader_is_not_registered(
@@ -410,7 +419,7 @@ def test_what_is_no_reader_is_not_registered(
     monkeypatch.setattr(readers, "_registered", {})
     with pytest.raises(InputError, match=match):
         register_reader(candidate)
-    assert ".xyz" not in known_endings()
+    assert ".pts" not in known_endings()
 
 
 @pytest.mark.parametrize("points", [np.zeros((5, 2)), np.zeros(3), np.full((5, 3), "a")])
@@ -418,16 +427,16 @@ def test_points_that_are_no_points_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, points: np.ndarray
 ) -> None:
     monkeypatch.setattr(readers, "_registered", {})
-    register_reader(reader(".xyz", read=lambda path: io.PointCloud(points)))
-    (tmp_path / "pile.xyz").write_text("")
-    refused(tmp_path / "pile.xyz", "`points`")
+    register_reader(reader(".pts", read=lambda path: io.PointCloud(points)))
+    (tmp_path / "pile.pts").write_text("")
+    refused(tmp_path / "pile.pts", "`points`")
 
 
 def test_a_reader_that_returns_something_else_is_a_fault_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(readers, "_registered", {})
-    register_reader(reader(".xyz"))
-    (tmp_path / "pile.xyz").write_text("")
+    register_reader(reader(".pts"))
+    (tmp_path / "pile.pts").write_text("")
     with pytest.raises(TypeError, match="returned None"):
-        io.read_pile(tmp_path / "pile.xyz")
+        io.read_pile(tmp_path / "pile.pts")

@@ -40,8 +40,10 @@ class _InOrder(click.Group):
 def wlplan(context: click.Context) -> None:
     """Plan the bucket loads of a wheel loader from a scan of the pile.
 
-    PILE is a heightmap (.npz, GeoTIFF) or a point cloud (.las, .laz, .ply). The word `bundled`
-    stands for the pile that ships with the package. It is the default where PILE may be left out.
+    PILE is a heightmap (.npz, GeoTIFF as .tif or .tiff, an ASCII grid as .asc, a grid_map in .bag,
+    .mcap or .db3), a point cloud (.las, .laz, .ply, .pcd, .e57, text as .xyz, .csv or .txt) or a
+    mesh (.obj, .stl). The word `bundled` stands for the pile that ships with the package. It is
+    the default where PILE may be left out.
     """
     if context.invoked_subcommand is None:
         click.echo(context.get_help())

@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any, cast
 
 import click
 
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
+from wlplan.errors import InputError
 from wlplan.planning import planners
 from wlplan.planning.objectives import OBJECTIVES
 from wlplan.plugins import is_reference
@@ -22,6 +25,7 @@ from wlplan.worlds.names import ENGINES, FOR_PLANNING
 
 # Names that the modules behind define, repeated here to keep help fast; a test compares them.
 PROTOCOLS = ("paper", "corridor", "slow")
+UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 BUNDLED = "bundled"
 """What stands for the pile that ships with the package where a file is asked for."""
@@ -167,6 +171,37 @@ class NameOrReference(click.ParamType):  # type: ignore[type-arg]
                 ctx,
             )
         return text
+
+
+class LevelOrFile(click.ParamType):  # type: ignore[type-arg]
+    """A height, or a file of heights of a kind that can be read."""
+
+    name = "LEVEL|FILE"
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """What stands for the value in the help."""
+        return self.name
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float | str:
+        """The level [m], or the name of the file."""
+        from wlplan.io.readers import find_reader
+
+        text = str(value)
+        try:
+            level = float(text)
+        except ValueError:
+            if not os.path.isfile(text):
+                self.fail(f"{text!r} is neither a level in metres nor a file", param, ctx)
+            try:
+                find_reader(Path(text))
+            except InputError as error:
+                self.fail(str(error), param, ctx)
+            return text
+        if not math.isfinite(level):
+            self.fail(f"{text!r} is no finite level", param, ctx)
+        return level
 
 
 def with_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -327,12 +362,24 @@ READING = {
         default=None,
         help="Read only this rectangle, in the coordinates of the file.",
     ),
+    "layer": click.option(
+        "--layer",
+        metavar="NAME",
+        default=None,
+        help="Layer of a grid_map that holds the heights. Default: elevation, or the only one.",
+    ),
+    "up": click.option(
+        "--up",
+        type=click.Choice(UPS),
+        default=None,
+        help="Axis of a point cloud or mesh that is up. Default: z, or y of an .obj that looks so.",
+    ),
     "ground": click.option(
         "--ground",
-        type=float,
+        type=LevelOrFile(),
         default=None,
-        help="Level of the floor under the pile [m], in the heights of the scan. Default: "
-        "estimated from the ground around it.",
+        help="Floor under the pile: its level [m], in the heights of the scan, or a scan of it in "
+        "the same coordinates. Default: estimated from the ground around the pile.",
     ),
 }
 """Options of how a pile is read, by the argument of `wlplan.io.read_scan` that each gives."""

@@ -25,8 +25,11 @@ def library(name: str, *, install: str) -> Iterator[ModuleType]:
     Raises:
         InputError: If it is not installed.
     """
-    logger = logging.getLogger(name)
-    before, logger.disabled = logger.disabled, True
+    logger, silence = logging.getLogger(name), logging.NullHandler()
+    before = logger.disabled, logger.propagate
+    # What its modules log goes through its own logger, and no further.
+    logger.disabled, logger.propagate = True, False
+    logger.addHandler(silence)
     try:
         try:
             module = importlib.import_module(name)
@@ -36,7 +39,8 @@ def library(name: str, *, install: str) -> Iterator[ModuleType]:
             ) from error
         yield module
     finally:
-        logger.disabled = before
+        logger.disabled, logger.propagate = before
+        logger.removeHandler(silence)
 
 
 @contextlib.contextmanager

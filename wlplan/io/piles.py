@@ -13,6 +13,7 @@ import io
 import math
 import os
 import warnings
+from collections.abc import Collection, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -25,8 +26,11 @@ from wlplan.constants import CELL_SIZE
 from wlplan.errors import InputError, one_line
 from wlplan.io.clouds import grid_points
 from wlplan.io.files import check_is_file, named, write_bytes_atomic
+from wlplan.io.floors import floor_of
+from wlplan.io.overview import averaged, coarse_cell, where_piles_are
 from wlplan.io.readers import find_reader
-from wlplan.io.scans import Heightmap, PointCloud, Scan, check_size, crop, real_numbers
+from wlplan.io.scans import Heightmap, PointCloud, Scan, check_size, corners, crop, real_numbers
+from wlplan.io.upright import upright
 from wlplan.site.frame import Frame
 from wlplan.terrain.floor import estimate_ground, fill_unseen
 from wlplan.terrain.resampling import resample
@@ -43,6 +47,9 @@ _FAR = 10_000.0
 # Slope of the ground as a whole above which a note says so [degrees].
 _SLOPING = 5.0
 _HIGH = 100.0
+# Options that every file takes, and the part by which a crop is wider for the scan of a floor.
+_ALL_TAKE = ("crop", "up")
+_MARGIN = 0.1
 
 
 def bundled_pile_path() -> Path:
@@ -68,7 +75,7 @@ class ScannedPile:
 def read_pile(
     path: str | os.PathLike[str],
     *,
-    ground: Float[Array | np.ndarray, "nx ny"] | float | None = None,
+    ground: Float[Array | np.ndarray, "nx ny"] | float | str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> Pile:
     """Read a pile and resample it to the grid spacing of the models, 0.1 m.
@@ -92,28 +99,34 @@ def read_pile(
 def read_scan(
     path: str | os.PathLike[str],
     *,
-    ground: Float[Array | np.ndarray, "nx ny"] | float | None = None,
+    ground: Float[Array | np.ndarray, "nx ny"] | float | str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> ScannedPile:
     """Read a pile, with what is worth knowing of its file.
 
-    The ending of the name decides the format: height maps are `.npz` or GeoTIFF, point clouds LAS,
-    LAZ or PLY, z up. Lengths in other units are converted to metres where the file names them. The
+    The ending of the name decides the format. Height maps are `.npz`, GeoTIFF, ESRI ASCII grids and
+    the maps of grid_map in recordings of ROS; point clouds LAS, LAZ, PLY, PCD, E57 and text; meshes
+    OBJ and STL. Lengths in other units are converted to metres where the file names them. The
     modules of `wlplan.io.readers`, one for each format, say what a file has to hold;
     `wlplan.io.register_reader` takes more of them. The height of a cell of a point cloud is the
-    median of its points; cells without points are unseen, but for single ones amid seen cells.
+    median of its points, that of a mesh its highest face; cells without any are unseen, but for
+    single ones amid seen cells.
 
     Unseen cells are filled smoothly from seen ones; a fill that the file brings is kept where it
     lies within the range of the seen heights. Coordinates far from zero: see the module.
 
     Args:
         path: File to read.
-        ground: Floor under the pile [m] in the file's frame: a level, or a map on the grid of the
-            file. By default that of the file, else `terrain.floor.estimate_ground` finds it around
-            the toe. It is lowered to the surface wherever it lies above.
+        ground: Floor under the pile [m] in the file's frame: a level, a map on the grid of the
+            file, or the path of a scan of the floor in the same coordinates, in any format that is
+            read; where that one saw nothing the floor is estimated. By default that of the file,
+            else `terrain.floor.estimate_ground` finds it around the toe. It is lowered to the
+            surface wherever it lies above.
         options: `crop`, the rectangle that is read: x and y of two opposite corners, in the
-            coordinates of the file. Others are for the reader of the format, which names them in
-            `OPTIONS`: `band` of a GeoTIFF.
+            coordinates of the file. `up`, the axis of a point cloud or mesh that is up, such as
+            "y", which is turned to be z before anything else, the crop too. Others are for the
+            reader of the format, which names them in `OPTIONS`: `band` of a GeoTIFF, `layer` of a
+            grid_map.
 
     Returns:
         The pile on the 0.1 m grid, with its ground, and the notes.
@@ -122,20 +135,34 @@ def read_scan(
         InputError: If the file cannot be used; one line that says why and what to do.
     """
     path = Path(path)
+    scan = _heights(path, options)
+    floor: Any = ground
+    if isinstance(ground, str | os.PathLike):
+        floor = _ground_scan(Path(ground), scan, path, options)
+    with named(path):
+        pile, frame, notes = _to_pile(scan, floor)
+        return ScannedPile(pile, frame, (*scan.notes, *notes, *_sloping(pile)))
+
+
+def _heights(path: Path, options: Mapping[str, Any]) -> Heightmap:
+    """What a file holds, on its own grid and not yet checked."""
     reader = find_reader(path)
     check_is_file(path, "pile")
     with named(path):
         taken = getattr(reader, "OPTIONS", ())
         for name in options:
-            if name not in (*taken, "crop"):
+            if name not in (*taken, *_ALL_TAKE):
                 raise InputError(f"there is no {name} to choose in {path.suffix} files.")
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 read: Any = reader.read
-                scan = read(path, **{name: options[name] for name in options if name in taken})
-                if "crop" in options and "crop" not in taken and isinstance(scan, Scan):
-                    scan = crop(scan, options["crop"])
+                # Turned first, then cropped: a reader that only crops leaves that to us.
+                own = {name for name in options if name in taken}
+                if "up" in options and "up" not in taken:
+                    own -= {"crop"}
+                scan = read(path, **{name: options[name] for name in own})
+                scan = _turned_and_cropped(scan, options, taken, own)
                 if isinstance(scan, PointCloud):
                     scan = grid_points(scan)
         except InputError:
@@ -149,8 +176,47 @@ def read_scan(
             ) from error
         if not isinstance(scan, Heightmap):
             raise TypeError(f"The reader of {path} returned {scan!r}: not a Heightmap, PointCloud.")
-        pile, frame = _to_pile(scan, ground)
-        return ScannedPile(pile, frame, (*scan.notes, *_sloping(pile)))
+        return scan
+
+
+def _turned_and_cropped(
+    scan: Any, options: Mapping[str, Any], taken: Collection[str], own: Collection[str]
+) -> Any:
+    """A scan after what its reader left of the options that all files take."""
+    if isinstance(scan, PointCloud) and "up" not in taken:
+        scan = upright(scan, options.get("up"))
+    elif isinstance(scan, Heightmap) and options.get("up", "z") != "z" and "up" not in own:
+        raise InputError("is a height map, which has z up: leave out --up.")
+    if "crop" in options and "crop" not in own and isinstance(scan, Scan):
+        scan = crop(scan, options["crop"])
+    return scan
+
+
+def _ground_scan(
+    path: Path, scan: Heightmap, of: Path, options: Mapping[str, Any]
+) -> tuple[Path, Heightmap]:
+    """The scan of the floor under another one, which is named `of`, and its place."""
+    # The same part, and a bit around it: cells at the border have neighbours there.
+    options = {name: options[name] for name in _ALL_TAKE if name in options}
+    if path.suffix.lower() != of.suffix.lower():
+        options.pop("up", None)
+    if "crop" in options:
+        low, high = corners(options["crop"])
+        margin = _MARGIN * (high - low)
+        options["crop"] = (*(low - margin), *(high + margin))
+    ground = _heights(path, options)
+    if None not in (ground.crs, scan.crs) and ground.crs != scan.crs:
+        raise InputError(
+            f"{path}: is in {ground.crs}, but {of} in {scan.crs}: project one of them."
+        )
+    with named(path):
+        # Checked as a pile is.
+        check_size(ground.height.shape, ground.cell_size)
+        seen = _valid(ground.valid, ground.height.shape)
+        seen &= np.isfinite(real_numbers("height", ground.height))
+        if not seen.any():
+            raise InputError("no cell counts as seen: check the mask or the nodata value.")
+    return path, dataclasses.replace(ground, valid=seen)
 
 
 def _sloping(pile: Pile) -> tuple[str, ...]:
@@ -165,13 +231,15 @@ def _sloping(pile: Pile) -> tuple[str, ...]:
     return (f"the ground slopes by {slope:.0f} degrees: level the scan if the site does not",)
 
 
-def _to_pile(scan: Heightmap, ground: Array | np.ndarray | float | None) -> tuple[Pile, Frame]:
-    """Check a scan, fill its gaps, resample it and find its ground."""
+def _to_pile(
+    scan: Heightmap, ground: Array | np.ndarray | float | tuple[Path, Heightmap] | None
+) -> tuple[Pile, Frame, tuple[str, ...]]:
+    """Check a scan, fill its gaps, resample it and find its ground; with notes of the latter."""
     height, origin = real_numbers("height", scan.height), real_numbers("origin", scan.origin)
     if height.ndim != 2:
         raise InputError(f"`height` has shape {height.shape}: it has to be 2-D, x by y.")
     shape = height.shape
-    check_size(shape, scan.cell_size)
+    check_size(shape, scan.cell_size, lambda: _overview(scan, height, origin))
     if origin.shape != (2,) or not (np.abs(origin) <= _FARTHEST).all():
         raise InputError("`origin` has to be x and y of the first cell, two numbers in metres.")
     valid = _valid(scan.valid, shape)
@@ -193,7 +261,16 @@ def _to_pile(scan: Heightmap, ground: Array | np.ndarray | float | None) -> tupl
         known = valid | ((height >= low) & (height <= high))
     height = fill_unseen(height, known)
 
-    floor = scan.ground if ground is None else ground
+    floor: Any = scan.ground if ground is None else ground
+    known_floor = np.ones(shape, bool)
+    notes: tuple[str, ...] = ()
+    if isinstance(floor, tuple):
+        place, known_scan = floor
+        with named(place):
+            floor, notes = floor_of(known_scan, height, valid, scan.cell_size, origin)
+        notes += tuple(f"of the floor: {note}" for note in known_scan.notes)
+        known_floor = np.isfinite(floor)
+        floor = np.where(known_floor, floor, height)
     if isinstance(floor, float | int):
         floor = np.full(shape, float(floor))
     if floor is not None:
@@ -221,11 +298,32 @@ def _to_pile(scan: Heightmap, ground: Array | np.ndarray | float | None) -> tupl
         ),
         CELL_SIZE,
     )
-    if floor is None:
+    if floor is None or not known_floor.all():
         found = floats(estimate_ground(pile.height, CELL_SIZE, pile.valid))
-        pile = pile.replace(ground=jnp.minimum(found, pile.height))
+        estimated = jnp.minimum(found, pile.height)
+        if floor is not None:
+            whole = Pile(
+                height=floats(floor), cell_size=scan.cell_size, valid=jnp.asarray(known_floor)
+            )
+            given = np.asarray(resample(whole, CELL_SIZE).valid)
+            estimated = jnp.where(given, pile.floor, estimated)
+        pile = pile.replace(ground=estimated)
     frame = Frame((float(offset[0]), float(offset[1]), sea_level), scan.crs)
-    return pile.replace(cell_size=CELL_SIZE), frame
+    return pile.replace(cell_size=CELL_SIZE), frame, notes
+
+
+def _overview(
+    scan: Heightmap, height: Float[np.ndarray, "nx ny"], origin: Float[np.ndarray, "2"]
+) -> str:
+    """Where the piles are in a map that is too large."""
+    shape = np.array(height.shape)
+    times = max(1, round(coarse_cell(shape * scan.cell_size) / scan.cell_size))
+    if origin.shape != (2,) or (shape < times).any():
+        return ""
+    seen = _valid(scan.valid, height.shape) & np.isfinite(height)
+    means, covered = averaged(height, seen, times)
+    first = origin + 0.5 * (times - 1) * scan.cell_size
+    return where_piles_are(means, covered, times * scan.cell_size, first)
 
 
 def _valid(valid: np.ndarray | None, shape: tuple[int, ...]) -> Bool[np.ndarray, "nx ny"]:

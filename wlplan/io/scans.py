@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,6 +20,8 @@ from wlplan.errors import InputError
 # 3.6 m window of the models, and most cells a side that are taken.
 _SHORTEST_SIDE = 4.0
 _MOST_CELLS = 4000
+# Points that are looked at at once: what is made of them on the way stays below 200 MiB.
+_AT_ONCE = 1 << 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,14 +54,37 @@ class PointCloud:
     """Points on the surface, in the frame of the file: x east, y north, z up.
 
     Attributes:
-        points: x, y and z [m], shape [n, 3], in any order. Points that are not finite are left out.
+        points: x, y and z, shape [n, 3], in any order. Points that are not finite are left out.
         crs: As for a height map.
         notes: Likewise.
+        scale: What `points` is multiplied by to be in metres, for x, y and z, shape [3]; None if it
+            is so already. With `offset` it keeps many points as small as their file has them.
+        offset: What is added then [m], shape [3]; None for nothing.
+        unit: Length of the unit of x and y in the file [m], for places that are named to the user.
     """
 
     points: np.ndarray
     crs: str | None = None
     notes: tuple[str, ...] = ()
+    scale: np.ndarray | None = None
+    offset: np.ndarray | None = None
+    unit: float = 1.0
+
+    def coordinates(self, rows: slice | np.ndarray) -> np.ndarray:
+        """x, y and z of some points [m], float64, shape [m, 3].
+
+        Args:
+            rows: Which of them.
+        """
+        places = real_numbers("points", self.points[rows])
+        if self.scale is not None:
+            places = places * self.scale
+        return places if self.offset is None else places + self.offset
+
+    def parts(self) -> Iterator[slice]:
+        """All rows, as many at once as fit into little memory."""
+        for start in range(0, len(self.points), _AT_ONCE):
+            yield slice(start, min(start + _AT_ONCE, len(self.points)))
 
 
 Scan: TypeAlias = Heightmap | PointCloud
@@ -80,7 +106,16 @@ def crop(scan: Scan, box: Box) -> Scan:
         InputError: If nothing lies inside.
     """
     if isinstance(scan, PointCloud):
-        return dataclasses.replace(scan, points=scan.points[points_inside(scan.points, box)])
+        if np.ndim(scan.points) != 2 or not len(scan.points):
+            return scan
+        inside = np.concatenate(
+            [points_inside(scan.coordinates(part), box) for part in scan.parts()]
+        )
+        if not inside.any():
+            ends = [_ends(scan.coordinates(part)) for part in scan.parts()]
+            low, high = np.array(ends)[:, 0].min(axis=0), np.array(ends)[:, 1].max(axis=0)
+            raise nothing_inside(low, high)
+        return dataclasses.replace(scan, points=scan.points[inside])
     low, high = corners(box)
     origin, sides = np.asarray(scan.origin, np.float64), np.array(scan.height.shape[:2])
     first = np.clip(np.ceil((low - origin) / scan.cell_size), 0, sides).astype(int)
@@ -95,16 +130,19 @@ def crop(scan: Scan, box: Box) -> Scan:
     return dataclasses.replace(scan, origin=origin + first * scan.cell_size, **maps)
 
 
-def points_inside(points: np.ndarray, box: Box) -> np.ndarray:
-    """Which points, shape [n, 3], lie inside a rectangle, shape [n].
+def _ends(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest finite x, y and z; infinite, the wrong way round, where none is."""
+    finite = np.isfinite(places)
+    return (
+        np.where(finite, places, np.inf).min(axis=0),
+        np.where(finite, places, -np.inf).max(axis=0),
+    )
 
-    Raises:
-        InputError: If none does.
-    """
+
+def points_inside(points: np.ndarray, box: Box) -> np.ndarray:
+    """Which points, shape [n, 2] or [n, 3], lie inside a rectangle, shape [n]."""
     (low, high), places = corners(box), points[:, :2]
     inside: np.ndarray = np.asarray(((places >= low) & (places <= high)).all(axis=-1))
-    if not inside.any():
-        raise nothing_inside(places.min(axis=0), places.max(axis=0))
     return inside
 
 
@@ -139,12 +177,16 @@ def real_numbers(name: str, values: Any) -> np.ndarray:
         return numbers.astype(np.float64)
 
 
-def check_size(shape: tuple[int, ...], cell_size: float) -> None:
+def check_size(
+    shape: tuple[int, ...], cell_size: float, advice: Callable[[], str] = lambda: ""
+) -> None:
     """Refuse maps that no bucket fits into and maps that no memory holds.
 
     Args:
         shape: Cells along x and y.
         cell_size: Side of a cell [m].
+        advice: What to say after the complaint about a map that is too large, such as where the
+            piles are; only then called.
 
     Raises:
         InputError: If the map is one of those.
@@ -162,5 +204,5 @@ def check_size(shape: tuple[int, ...], cell_size: float) -> None:
         raise InputError(
             f"{text} in {shape[0]} x {shape[1]} cells: a side may have {_MOST_CELLS} cells, before "
             f"and after resampling to {CELL_SIZE:g} m; crop it to the pile (--crop), or check the "
-            f"units."
+            f"units{advice()}."
         )

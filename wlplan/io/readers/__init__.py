@@ -15,7 +15,7 @@ command line asks for the endings before it imports anything heavy. Readers else
 named after its ending without the dot::
 
     [project.entry-points."wlplan.readers"]
-    xyz = "their_package.xyz"
+    pts = "their_package.pts"
 
 Nobody else can register the endings of the package's own readers.
 """
@@ -60,7 +60,7 @@ def register_reader(reader: Reader) -> None:
         reader: Module or object with `ENDINGS` and `read`. Registering it again changes nothing.
 
     Raises:
-        InputError: If it lacks one of them, an ending is not like `.xyz`, or another reader has it.
+        InputError: If it lacks one of them, an ending is not like `.pts`, or another reader has it.
     """
     _add(reader, _registered, _own() | _registered)
 
@@ -143,7 +143,7 @@ def _check(reader: object) -> None:
     if isinstance(endings, str) or not endings or not all(map(_is_ending, endings)):
         raise InputError(
             f"{_name(reader)} has `ENDINGS` {endings!r}: give a tuple of endings in lower case, "
-            f'such as (".xyz",).'
+            f'such as (".pts",).'
         )
 
 

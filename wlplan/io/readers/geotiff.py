@@ -24,6 +24,8 @@ from wlplan.io.scans import Box, Heightmap, check_size, corners, nothing_inside
 ENDINGS = (".tif", ".tiff")
 OPTIONS = ("band", "crop")
 
+# How TIFF and BigTIFF begin, in either order of bytes.
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # What bands of heights are called.
 _HEIGHTS = re.compile(r"height|elev|altitude|\b(dsm|dtm|dem|dgm|dom|z)\b", re.IGNORECASE)
 _COLOURS = {"red", "green", "blue", "palette", "hue", "saturation", "lightness", "cyan", "magenta"}
@@ -45,7 +47,16 @@ def read(path: Path, *, band: int | None = None, crop: Box | None = None) -> Hei
         InputError: If rasterio or pyproj is missing, the band is not clear or a colour, the cells
             are not square and along the axes, or the coordinates are no lengths on the ground.
     """
-    with library("rasterio", install="wlplan[scan]") as rasterio, rasterio.open(path) as file:
+    with path.open("rb") as start:
+        if start.read(4) not in _TIFF:
+            raise InputError("is no TIFF file: give it the ending of its format.")
+    # A whole path and one driver: nothing else is opened than that file, whatever its name looks
+    # like.
+    place = path.absolute()
+    with (
+        library("rasterio", install="wlplan[scan]") as rasterio,
+        rasterio.open(place, driver="GTiff") as file,
+    ):
         step = file.transform
         if step.is_identity:
             raise InputError(
@@ -69,7 +80,11 @@ def read(path: Path, *, band: int | None = None, crop: Box | None = None) -> Hei
             window = _window(rasterio, file, crop)
             step = file.window_transform(window)
         size = (file.width, file.height) if window is None else (window.width, window.height)
-        check_size(size, cell * horizontal)
+        check_size(
+            size,
+            cell * horizontal,
+            lambda: _overview(rasterio, file, number, window, (horizontal, vertical)),
+        )
         raw, mask = file.read(number, window=window), _seen(file, number, window)
         scale, shift = file.scales[number - 1], file.offsets[number - 1]
         tagged = file.nodatavals[number - 1] is not None
@@ -129,6 +144,41 @@ def _window(rasterio: Any, file: Any, box: Box) -> Any:
         all_of_it = np.array([file.transform * (0, 0), file.transform * sides])
         raise nothing_inside(all_of_it.min(axis=0), all_of_it.max(axis=0))
     return rasterio.windows.Window(*map(int, first), *map(int, stop - first))
+
+
+def _overview(
+    rasterio: Any, file: Any, number: int, window: Any, factors: tuple[float, float]
+) -> str:
+    """Where the piles are in a raster that is too large, read in wide cells."""
+    from wlplan.io.overview import coarse_cell, where_piles_are
+
+    horizontal, vertical = factors
+    window = rasterio.windows.Window(0, 0, file.width, file.height) if window is None else window
+    step = file.window_transform(window)
+    if step.a < 0.0 or step.e > 0.0:
+        return ""
+    cell = step.a * horizontal
+    sides = np.array([window.width, window.height])
+    times = max(1, round(coarse_cell(sides * cell) / cell))
+    rows, columns = sides[1] // times, sides[0] // times
+    window = rasterio.windows.Window(
+        window.col_off, window.row_off, int(columns) * times, int(rows) * times
+    )
+    shape = (int(rows), int(columns))
+    average = rasterio.enums.Resampling.average
+    heights = file.read(
+        number, window=window, out_shape=shape, resampling=average, masked=True, out_dtype=float
+    )
+    heights = heights * file.scales[number - 1] + file.offsets[number - 1]
+    seen = ~np.ma.getmaskarray(heights) & np.isfinite(heights.filled(np.nan))
+    origin = horizontal * np.array([step.c, step.f - int(rows) * times * step.a])
+    return where_piles_are(
+        np.where(seen, heights.filled(0.0) * vertical, 0.0)[::-1].T,
+        seen[::-1].T,
+        cell * times,
+        origin + 0.5 * cell * times,
+        unit=horizontal,
+    )
 
 
 def _seen(file: Any, number: int, window: Any) -> np.ndarray:

@@ -1,11 +1,13 @@
 """`.las`, `.laz`: LAS point clouds, plain or compressed; x, y, z, z up.
 
 Lengths are converted to metres from the units of the reference system, WKT or GeoTIFF keys. Points
-that their classes call noise or no soil, and those that are withheld, are left out.
+that their classes call noise or no soil, and those that are withheld, are left out. They are read
+part by part, and kept as the integers that the file has.
 """
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import struct
 from pathlib import Path
@@ -16,7 +18,7 @@ import numpy as np
 from wlplan.errors import InputError
 from wlplan.io.libraries import library, mute_stderr
 from wlplan.io.reference import Reference, length_unit_of_code, reference_of
-from wlplan.io.scans import Box, PointCloud, points_inside
+from wlplan.io.scans import Box, PointCloud, nothing_inside, points_inside
 
 ENDINGS = (".las", ".laz")
 OPTIONS = ("crop",)
@@ -34,6 +36,8 @@ _MODEL, _GEOGRAPHIC, _PROJECTED, _PLAN_UNIT, _VERTICAL, _HEIGHT_UNIT = (
 )
 _DEGREES, _EARTH_CENTRED = 2, 3
 _LAST_CODE = 32766
+# Points that are read at once, and points that say where the middle of all is.
+_AT_ONCE, _SOME = 1 << 20, 1 << 20
 
 
 def read(path: Path, *, crop: Box | None = None) -> PointCloud:
@@ -50,46 +54,80 @@ def read(path: Path, *, crop: Box | None = None) -> PointCloud:
     with library("laspy", install="wlplan[scan]") as laspy:
         _check_header(path)
         try:
-            with mute_stderr():
-                # The parallel decompressor would set aside memory for as many points as a damaged
-                # chunk size asks for.
-                cloud = laspy.read(path, laz_backend=laspy.LazBackend.Lazrs)
+            # The parallel decompressor would set aside memory for as many points as a damaged chunk
+            # size asks for.
+            backend = laspy.LazBackend.Lazrs
+            with mute_stderr(), laspy.open(path, laz_backend=backend) as file:
+                header = file.header
+                points, left_out = _on_soil(file, crop)
         except BaseException as error:
             # A panic of the decompressor, which is written in Rust, is no `Exception`.
             if type(error).__name__ != "PanicException":
                 raise
             raise RuntimeError(str(error)) from error
-        points = np.stack([np.asarray(cloud[axis], np.float64) for axis in "xyz"], axis=-1)
-        if crop is not None:
-            inside = points_inside(points, crop)
-            points, cloud = points[inside], cloud[inside]
-        kept, left_out = _on_soil(cloud)
-        points = points[kept]
+        scale, offset = np.asarray(header.scales), np.asarray(header.offsets)
         middle = (0.0, 0.0)
         if len(points):
-            middle = (float(np.median(points[:, 0])), float(np.median(points[:, 1])))
-        reference = _reference(cloud.header, middle)
+            some = points[:: len(points) // _SOME + 1, :2] * scale[:2] + offset[:2]
+            middle = (float(np.median(some[:, 0])), float(np.median(some[:, 1])))
+        reference = _reference(header, middle)
     horizontal, vertical, assumed = reference.factors()
-    points *= (horizontal, horizontal, vertical)
-    return PointCloud(points, crs=reference.name, notes=(*assumed, *left_out))
+    factors = np.array([horizontal, horizontal, vertical])
+    return PointCloud(
+        points,
+        crs=reference.name,
+        notes=(*assumed, *left_out),
+        scale=scale * factors,
+        offset=offset * factors,
+        unit=horizontal,
+    )
 
 
-def _on_soil(cloud: Any) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Which points lie on soil, and what was left out, in words."""
-    classes, withheld = np.asarray(cloud.classification), np.asarray(cloud.withheld, bool)
-    counts = {
-        f"{name} (class {number})": int((~withheld & (classes == number)).sum())
-        for number, name in _NOT_SOIL.items()
-    }
-    counts["withheld"] = int(withheld.sum())
-    out = withheld | np.isin(classes, list(_NOT_SOIL))
-    parts = [f"{count} of {name}" for name, count in counts.items() if count]
-    if not parts:
-        return ~out, ()
-    left = f"of {len(classes)} points: {', '.join(parts)}"
-    if out.all():
+def _on_soil(file: Any, crop: Box | None) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The points that lie on soil, as the integers of the file, and what was left out, in words."""
+    parts = [np.empty((0, 3), np.int32)]
+    counts: collections.Counter[str] = collections.Counter()
+    total, low, high = 0, np.full(2, np.inf), np.full(2, -np.inf)
+    for record in file.chunk_iterator(_AT_ONCE):
+        points = np.stack([np.asarray(record[axis]) for axis in "XYZ"], axis=-1)
+        if crop is not None:
+            places = np.stack([np.asarray(record[axis], np.float64) for axis in "xy"], axis=-1)
+            low, high = (
+                np.minimum(low, places.min(axis=0)),
+                np.maximum(high, places.max(axis=0)),
+            )
+            inside = points_inside(places, crop)
+            points, record = points[inside], record[inside]
+        total += len(points)
+        classes, withheld = np.asarray(record.classification), np.asarray(record.withheld, bool)
+        numbers = np.bincount(classes[~withheld], minlength=256)
+        counts += collections.Counter(
+            {f"{name} (class {k})": int(numbers[k]) for k, name in _NOT_SOIL.items()}
+        )
+        counts += collections.Counter({"withheld": int(withheld.sum())})
+        parts.append(points[~(withheld | np.isin(classes, list(_NOT_SOIL)))])
+    if crop is not None and not total and low[0] <= high[0]:
+        raise nothing_inside(low, high)
+    points = _joined(parts)
+    names = [*(f"{name} (class {k})" for k, name in _NOT_SOIL.items()), "withheld"]
+    words = [f"{counts[name]} of {name}" for name in names if counts[name]]
+    if not words:
+        return points, ()
+    left = f"of {total} points: {', '.join(words)}"
+    if not len(points):
         raise InputError(f"holds nothing of a pile, {left}; classify its soil as ground.")
-    return ~out, (f"left out, {left}",)
+    return points, (f"left out, {left}",)
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """All parts in one array; the list is emptied on the way, so that they are in memory once."""
+    whole = np.empty((sum(map(len, parts)), 3), parts[0].dtype)
+    start = len(whole)
+    while parts:
+        part = parts.pop()
+        start -= len(part)
+        whole[start : start + len(part)] = part
+    return whole
 
 
 def _reference(header: Any, middle: tuple[float, float]) -> Reference:

@@ -21,14 +21,23 @@ def read(path: Path) -> Heightmap:
     """Read the arrays; none of them may need pickle.
 
     Raises:
-        InputError: If `height` or `cell_size` is missing, or the latter is no number.
+        InputError: If `height` or `cell_size` is missing, the latter is no number, or a field holds
+            objects.
     """
     with path.open("rb") as file:
+        if not file.read(6).startswith((b"PK", b"\x93NUMPY")):
+            raise InputError("is no .npz file: save it by np.savez with height and cell_size.")
+        file.seek(0)
         archive = np.load(file, allow_pickle=False)
         if isinstance(archive, np.ndarray):
             raise InputError("holds a single array: save it by np.savez with height and cell_size.")
         # Every field is read here, so that damage shows up here.
-        fields = {name: archive[name] for name in archive.files}
+        try:
+            fields = {name: archive[name] for name in archive.files}
+        except ValueError as error:
+            if "Object arrays" not in str(error):
+                raise
+            raise InputError("holds Python objects: save plain arrays of numbers.") from error
     for name in ("height", "cell_size"):
         if name not in fields:
             raise InputError(

@@ -1,0 +1,159 @@
+"""Broken files of every format: a pile, or one line that says why not; nothing else, ever."""
+
+import resource
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scene
+from scan_files import write_las, write_ply, write_tif
+
+from wlplan.errors import InputError
+from wlplan.io import read_pile
+from wlplan.io.readers import known_endings
+
+# The corner with the mound: a small map is soon read.
+ROWS = scene.points(6.0)
+ROWS = ROWS[(ROWS[:, 0] > 17.0) & (ROWS[:, 1] < 7.0)]
+HEIGHTS = scene.grid(0.4)[42:, :18]
+FACES = 2.0 * scene.triangles()[-72:]
+SMALL = {"elevation": HEIGHTS}
+
+
+def _npz(path: Path) -> None:
+    np.savez(path, height=HEIGHTS, cell_size=0.4)
+
+
+def _e57(path: Path) -> None:
+    place = np.array([3.0, 4.0, 2.0])
+    scene.write_e57(path, [(ROWS[::2], 0.3, place), (ROWS[1::2], 0.0, 0.0 * place)])
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    ".npz": _npz,
+    ".tif": lambda path: write_tif(path, HEIGHTS.T[::-1].copy(), step=0.4),
+    ".tiff": lambda path: write_tif(path, HEIGHTS.T[::-1].copy(), step=0.4, compress="deflate"),
+    ".las": lambda path: write_las(path, ROWS),
+    ".laz": lambda path: write_las(path, ROWS),
+    ".ply": lambda path: write_ply(path, ROWS),
+    "text.ply": lambda path: write_ply(path, ROWS, "ascii"),
+    ".pcd": lambda path: scene.write_pcd(path, ROWS),
+    "text.pcd": lambda path: scene.write_pcd(path, ROWS, "ascii"),
+    "packed.pcd": lambda path: scene.write_pcd(path, ROWS, "binary_compressed"),
+    ".e57": _e57,
+    ".obj": lambda path: scene.write_obj(path, FACES),
+    ".stl": lambda path: scene.write_stl(path, FACES),
+    "text.stl": lambda path: scene.write_stl(path, FACES, text=True),
+    ".xyz": lambda path: scene.write_xyz(path, ROWS),
+    ".txt": lambda path: scene.write_xyz(path, ROWS, header="x [m] y [m] z [m]"),
+    ".csv": lambda path: scene.write_xyz(path, ROWS, delimiter=";", header="x;y;z"),
+    ".asc": lambda path: scene.write_grid(path, HEIGHTS, 0.4),
+    ".bag": lambda path: scene.write_bag(path, SMALL, cell=0.4),
+    ".mcap": lambda path: scene.write_bag(path, SMALL, cell=0.4),
+    ".db3": lambda path: scene.write_bag(path, SMALL, cell=0.4),
+}
+
+
+def mutants(content: bytes, random: np.random.Generator, rounds: int) -> Iterator[bytes]:
+    """Copies of a file that are cut, doubled, blanked, or have some bytes changed."""
+    size = len(content)
+    yield content[: int(random.uniform() * size)]
+    yield content + content
+    yield bytes(64) + content[64:]
+    for _ in range(rounds):
+        start = int(random.integers(0, min(size, 600)))
+        where = int(random.integers(0, size))
+        # Sizes and counts stand in heads and in tails, and full or empty ones are the worst.
+        for place in (start, where, size - start):
+            filling = 4 * (b"\0", b"\xff")[random.integers(0, 2)]
+            yield content[:place] + filling + content[place + 4 :]
+        # Digits stay digits in text, signs and exponents come in.
+        for reach, letters in ((400, range(256)), (size, range(256)), (size, b"0123456789-.e, \n")):
+            changed = bytearray(content)
+            for place in random.integers(0, min(size, reach), 3):
+                changed[place] = letters[random.integers(0, len(letters))]
+            yield bytes(changed)
+
+
+def checked(ending: str, content: bytes) -> bytes:
+    """The same with checksums that fit: those of E57 would catch whatever was changed."""
+    if ending != ".e57":
+        return content
+    pages = bytearray(content)
+    for start in range(0, len(pages) - 1023, 1024):
+        pages[start + 1020 : start + 1024] = _crc32c(pages[start : start + 1020]).to_bytes(4, "big")
+    return bytes(pages)
+
+
+_TABLE = []
+for _byte in range(256):
+    for _ in range(8):
+        _byte = _byte >> 1 ^ (0x82F63B78 if _byte & 1 else 0)
+    _TABLE.append(_byte)
+
+
+def _crc32c(content: bytes | bytearray) -> int:
+    value = 0xFFFFFFFF
+    for byte in content:
+        value = value >> 8 ^ _TABLE[(value ^ byte) & 255]
+    return value ^ 0xFFFFFFFF
+
+
+def outcomes(folder: Path, name: str, rounds: int) -> list[str]:
+    """What becomes of each mutant: "read", or the line that it was refused with."""
+    path = folder / f"a{name}"
+    WRITERS[name](path)
+    assert outcome(path) == "read"
+    content = path.read_bytes()
+    assert checked(path.suffix, content) == content
+    found = []
+    for broken in mutants(content, np.random.default_rng(zlib.crc32(name.encode())), rounds):
+        path.write_bytes(checked(path.suffix, broken))
+        found.append(outcome(path))
+        assert "\n" not in found[-1]
+    return found
+
+
+def outcome(path: Path) -> str:
+    try:
+        read_pile(path)
+    except InputError as error:
+        return str(error)
+    return "read"
+
+
+def test_every_ending_has_a_file_to_break() -> None:
+    assert {Path(f"a{name}").suffix for name in WRITERS} == set(known_endings())
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_broken_files_end_in_a_pile_or_in_one_line(
+    tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    found = outcomes(tmp_path, name, 1)
+    assert sum(one != "read" for one in found) >= 2
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WRITERS)
+def test_many_broken_files_end_so_in_little_memory(tmp_path: Path, name: str) -> None:
+    """In a process of its own, which may crash, hang or ask for too much by itself."""
+    code = (
+        f"import sys; sys.path[:0] = {sys.path!r}; import pathlib, test_readers_fuzz as f; "
+        f"f.limited(); print(len(f.outcomes(pathlib.Path({str(tmp_path)!r}), {name!r}, 90)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=1200
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{3 + 6 * 90}\n", "")
+
+
+def limited() -> None:
+    """Give this process 2 GiB more than it has, as far as the system counts that."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + 2**31,) * 2)
