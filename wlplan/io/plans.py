@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ def plan_to_dict(
     predicted: Performance | None = None,
     simulated: Performance | None = None,
     transport: Mapping[str, Any] | None = None,
+    paths: Sequence[Mapping[str, Any]] | None = None,
     **rest: Any,
 ) -> dict[str, Any]:
     """Lay a plan out as the content of a plan.json.
@@ -39,6 +40,7 @@ def plan_to_dict(
         predicted: Performance by the world that planned, leaves [N], tonne, s, kJ.
         simulated: Performance in the simulator, likewise.
         transport: Arrays [N] by name, "time" [s] and "work" [kJ], of driving to the truck and back.
+        paths: What else is said of each load: its path and its clearance.
         **rest: Further top-level fields: pile, world, objective, seed, total, ledger.
     """
     pose, action = _columns(plan.pose), _columns(plan.action)
@@ -54,6 +56,7 @@ def plan_to_dict(
         for part, columns in extra.items():
             if columns:
                 load[part] = {name: values[n] for name, values in columns.items()}
+        load |= {} if paths is None else paths[n]
         loads.append(load)
     return {"format": PLAN_FORMAT, **rest, "loads": loads}
 

@@ -28,7 +28,7 @@ _FARTHEST = 500.0
 # Height above the floor that counts as on the pile [m].
 _ON_PILE = 0.5
 # Dig locations around the pile, and how many of them, the nearest, a place is judged by.
-_LOCATIONS, _NEAREST = 24, 6
+_LOCATIONS, _NEAREST = 24, 3
 _HEADING_STEP = 15.0
 # Places for the receiver, in the frame of a dig pose: metres behind it and beside it, and degrees
 # between the headings, either side. They have the shortest ways from a straight face, in the mean

@@ -41,6 +41,7 @@ from wlplan.site.machine import WheelLoader
 from wlplan.site.receiver import Receiver, truck_outline
 from wlplan.terrain.heightmap import sample, to_world
 from wlplan.types import Pile, Pose
+from wlplan.xla import materialize
 
 # The fan. Reversing straight [m] and then along an arc [degrees], from either end; and around an
 # arc, straight on and around another arc, likewise.
@@ -227,10 +228,12 @@ def _ways(
 ) -> Way:
     """The shortest way by way of each cusp, and what it touches."""
     radius = machine.turning_radius
-    out, up = (_shortest(cusps, end, radius) for end in (start, goal))
+    shared = room.yard.origin[0]
+    out, up = materialize([_shortest(cusps, end, radius) for end in (start, goal)], shared)
     length = dubins.length_of(out, radius) + dubins.length_of(up, radius)
     parts = [_looks(curve, radius) for curve in (out, up)]
-    x, y, c, s, weight = (jnp.concatenate(leaves, axis=1) for leaves in zip(*parts, strict=True))
+    looks = [jnp.concatenate(leaves, axis=1) for leaves in zip(*parts, strict=True)]
+    x, y, c, s, weight = materialize(looks, shared)
     third = machine.length / 3.0
 
     def discs(front: float) -> tuple[Array, Array]:

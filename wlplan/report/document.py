@@ -8,11 +8,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from wlplan.constants import KG_PER_TONNE, QUANTITIES
 from wlplan.io.plans import plan_to_dict
+from wlplan.planning.clearance import clearance
 from wlplan.planning.job import PlanResult
+from wlplan.planning.way import points_of
+from wlplan.planning.yard import standing, unpacked_soil
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
 from wlplan.site.soil import Soil
@@ -55,8 +59,10 @@ def plan_document(
     }
     if predicted is not None:
         total = {"predicted": totals(predicted, predicted_cost), **total}
+    ways = {} if simulated.ways is None else {"paths": paths_of(before, simulated, site)}
     return plan_to_dict(
         simulated.plan,
+        **ways,
         predicted=predicted,
         simulated=simulated.rollout.performance,
         transport={"time": simulated.transport.time, "work": simulated.transport.work},
@@ -66,6 +72,41 @@ def plan_document(
         total=total,
         ledger=ledger_of(before, simulated, site.soil),
     )
+
+
+def paths_of(before: Pile, played: PlanResult, site: Site) -> list[dict[str, Any]]:
+    """What plan.json says about the way of each load: its points, length and clearance.
+
+    Args:
+        before: The pile before the first loading.
+        played: The plan as it was played, with its ways.
+        site: Machine and receiver.
+    """
+    assert played.ways is not None
+    machine, receiver = site.machine, receiver_fields(site.placed_receiver)
+    to = np.array([receiver[name] for name in RECEIVER_FIELDS])
+    stands, found = standing(before), []
+    ways = jax.tree.map(lambda leaf: np.asarray(leaf), played.ways)
+    pose = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(played.plan.pose)]
+    for n in range(len(pose[0])):
+        way, soil = jax.tree.map(lambda leaf, n=n: leaf[n], (ways.way, ways.soil))
+        points = points_of(way, machine.turning_radius)
+        blocked = stands | unpacked_soil(soil, before.height.shape)
+        dig = np.array([axis[n] for axis in pose])
+        found.append(
+            {
+                "path": {
+                    "points": [
+                        [round(x, 3), round(y, 3), round(heading, 5), int(gear)]
+                        for x, y, heading, gear in points.tolist()
+                    ],
+                    "length": float(way.length),
+                    "unseen": float(ways.unseen[n]),
+                },
+                "clearance": clearance(points, dig, blocked, before, to, machine),
+            }
+        )
+    return found
 
 
 def totals(performance: Performance, cost: float | None = None) -> dict[str, float]:
@@ -154,6 +195,7 @@ def write_plan_folder(
             simulated.rollout.pile,
             simulated.plan,
             receiver=site.placed_receiver,
+            ways=[np.array(load["path"]["points"]) for load in document["loads"] if "path" in load],
             frame=site.frame,
             after_title=f"After {count} load{'s' if count > 1 else ''} in the simulator",
         )

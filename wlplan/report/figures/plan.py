@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -19,6 +22,7 @@ from wlplan.report.figures.relief import (
 )
 from wlplan.report.figures.style import BLUE, frame_map, map_panels
 from wlplan.report.figures.truck import Truck, draw_truck
+from wlplan.report.figures.ways import draw_ways
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.receiver import Receiver
 from wlplan.types import LoadingPlan, Pile
@@ -30,6 +34,7 @@ def plan_figure(
     plan: LoadingPlan,
     *,
     receiver: Receiver | None = None,
+    ways: Sequence[Float[np.ndarray, "_ 4"]] = (),
     frame: Frame = LOCAL,
     after_title: str | None = None,
 ) -> Figure:
@@ -42,6 +47,7 @@ def plan_figure(
         after: Pile after the last one, on the same grid.
         plan: N loadings in order, leaves [N].
         receiver: Where the loader dumps, drawn as a truck across its heading.
+        ways: Points of the way of each load: x [m], y [m], heading [rad] and gear.
         frame: What the coordinates on the axes are in.
         after_title: Title of the second panel; by default the number of loads.
     """
@@ -51,7 +57,7 @@ def plan_figure(
     truck = None if receiver is None else Truck(receiver)
     seen = digs
     if truck is not None and truck.is_near(view):
-        seen = np.concatenate([digs, truck.body, truck.way - truck.ahead])
+        seen = np.concatenate([digs, truck.body, truck.way, *(way[:, :2] for way in ways)])
     # Labels are as large as the map allows, and the map widens to hold them.
     radius = LABEL_PART * float(np.ptp(view_of(before, seen), axis=0).max())
     labels = label_places(digs, heading, radius, before)
@@ -67,6 +73,7 @@ def plan_figure(
         frame_map(panel, view, title, frame)
         if truck is not None:
             draw_truck(panel, truck, view)
+    draw_ways(panels[0], ways)
     draw_digs(panels[0], digs, heading, labels, radius)
     for panel, line in zip(panels, ("solid", "dashed"), strict=True):
         draw_toe(panel, before, line)
@@ -78,5 +85,5 @@ def plan_figure(
     )
     bar.set_label("height above the ground [m]")
     bar.outline.set_visible(False)
-    add_legend(figure, before)
+    add_legend(figure, before, ways=bool(ways))
     return figure
