@@ -235,7 +235,7 @@ def test_the_options_reach_the_planner(run: Run, scan: str, calls: list[dict[str
     assert call["objective"] == objective.objective_of("energy")
     receiver = call["site"].receiver
     assert float(receiver.x) == -10.0
-    # Without a heading the one that suits: straight on, away from or past the pile, not back.
+    # Without a heading the one that suits: the truck does not stand between loader and pile.
     assert math.cos(float(receiver.heading)) < 0.9
 
 

@@ -19,11 +19,14 @@ from wlplan.planning.loading import Loading
 from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.planners import Gradient, Greedy, Nominal
 from wlplan.planning.poses import distance_to_toe, pose_at, toe_of
+from wlplan.site.receiver import Receiver
+from wlplan.site.site import Site
 from wlplan.terrain.excavation import excavate
 from wlplan.terrain.toe import TOE_RISE, ToeContour, toe_contour
 from wlplan.types import Action, Performance, Pile, Pose, action_vector
 
 BEST_ACTION = np.array([0.3, 2.0, 0.5, 3.5])
+SITE = Site(receiver=Receiver(jnp.float32(-12.5), jnp.float32(4.0), jnp.float32(1.3)))
 GREEDY = Greedy(actions=12, refine_steps=40, refined=4, poses_per_metre=0.5)
 NOMINAL = Nominal(actions=12, refine_steps=40, rows=2)
 GRADIENT = Gradient(
@@ -127,7 +130,9 @@ def test_only_accessible_points_are_dug() -> None:
 
 @pytest.mark.parametrize("planner", [GREEDY, NOMINAL])
 def test_the_best_action_is_found(planner: Greedy | Nominal) -> None:
-    plan = plan_loads(bowl_world, cone(), loads=2, planner=planner, contour=circle()).plan
+    plan = plan_loads(
+        bowl_world, cone(), loads=2, planner=planner, contour=circle(), site=SITE
+    ).plan
     found = np.asarray(action_vector(plan.action)) / np.array([0.7, 5.0, 0.7, 5.0])
     assert np.abs(found - BEST_ACTION / np.array([0.7, 5.0, 0.7, 5.0])).max() < 0.15
 
@@ -137,7 +142,7 @@ def plans() -> dict[str, PlanResult]:
     results = {}
     for planner in (NOMINAL, GREEDY, GRADIENT):
         results[type(planner).__name__.lower()] = plan_loads(
-            bowl_world, cone(), loads=3, planner=planner, contour=circle()
+            bowl_world, cone(), loads=3, planner=planner, contour=circle(), site=SITE
         )
     return results
 
@@ -150,7 +155,7 @@ def test_a_gradient_plan_costs_at_most_what_greedy_and_nominal_cost(
 
 
 def test_the_same_seed_gives_the_same_plan(plans: dict[str, PlanResult]) -> None:
-    again = plan_loads(bowl_world, cone(), loads=3, planner=GREEDY, contour=circle())
+    again = plan_loads(bowl_world, cone(), loads=3, planner=GREEDY, contour=circle(), site=SITE)
     for a, b in zip(
         jax.tree.leaves(again.plan), jax.tree.leaves(plans["greedy"].plan), strict=True
     ):
@@ -163,7 +168,7 @@ def test_a_result_is_what_its_plan_yields(plans: dict[str, PlanResult]) -> None:
     assert result.plan.pose.x.shape == (3,)
     assert result.costs.shape == (3,)
     assert float(result.costs.sum()) == pytest.approx(float(result.cost), rel=1e-6)
-    again = play(bowl_world, cone(), result.plan)
+    again = play(bowl_world, cone(), result.plan, site=SITE)
     np.testing.assert_allclose(
         again.rollout.performance.mass, result.rollout.performance.mass, rtol=1e-5
     )
@@ -181,6 +186,7 @@ def test_a_referee_has_the_last_word_among_the_candidates() -> None:
         "loads": 2,
         "planner": GRADIENT,
         "contour": circle(),
+        "site": SITE,
     }
     alone = plan_loads(bowl_world, cone(), **options)
     judged = plan_loads(bowl_world, cone(), referee=contrary, **options)
@@ -190,6 +196,7 @@ def test_a_referee_has_the_last_word_among_the_candidates() -> None:
         loads=2,
         planner=GREEDY,
         contour=circle(),
+        site=SITE,
         referee=contrary,
     )
     assert alone.refereed is None
@@ -199,7 +206,7 @@ def test_a_referee_has_the_last_word_among_the_candidates() -> None:
     assert judged.refereed.cost <= greedy.refereed.cost * (1 + 1e-6)
     assert judged.cost <= greedy.cost * (1 + 1e-5)
     # What the referee saw is the plan, with the poses of the result.
-    again = play(contrary, cone(), judged.plan)
+    again = play(contrary, cone(), judged.plan, site=SITE)
     assert float(again.cost) == pytest.approx(float(judged.refereed.cost), rel=1e-5)
     assert float(judged.refereed.cost) != float(judged.cost)
 
@@ -246,7 +253,7 @@ def test_a_plan_can_be_made_of_loading_plan_leaves() -> None:
         pose=Pose(jnp.asarray([-5.0]), jnp.asarray([0.0]), jnp.asarray([0.0])),
         action=Action(*(jnp.asarray([v], jnp.float32) for v in BEST_ACTION)),
     )
-    outcome = play(bowl_world, cone(), plan)
+    outcome = play(bowl_world, cone(), plan, site=SITE)
     assert float(outcome.rollout.performance.mass[0]) == pytest.approx(3.0, rel=1e-4)
 
 

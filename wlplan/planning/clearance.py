@@ -54,10 +54,12 @@ def clearance(
     truck = _from_frame(receiver, np.stack([axis.ravel() for axis in spread], axis=-1))
     for place in points[:, :3]:
         least = min(least, _distance(place, truck, -half, half - machine.overhang, side))
-    ahead, _ = _to_frame(dig, cells).T
-    behind = cells[ahead <= -LANE_END - half_cell]
     back = -machine.approach_distance - half
-    return min(least, _distance(dig, behind, back, -LANE_END, side) - half_cell)
+    for others, width in ((cells, half_cell), (truck, 0.0)):
+        ahead, _ = _to_frame(dig, others).T
+        behind = others[ahead <= -LANE_END - half_cell]
+        least = min(least, _distance(dig, behind, back, -LANE_END, side) - width)
+    return least
 
 
 def _distance(

@@ -21,6 +21,9 @@ WORDS = np.array([[1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]])
 # An arc this much less than nothing is none, and not a full circle [rad]: rounding.
 _NOTHING = 1e-4
 
+# Circles whose centres are this part of their radius apart count as the same: rounding.
+_SAME = 1e-3
+
 
 @no_type_check
 class Curve(struct.PyTreeNode):
@@ -62,7 +65,8 @@ def curve_between(
     crossing = 0.5 * (s0 - s1)
     left = squared - (2.0 * radius * crossing) ** 2
     exists = left >= 0.0
-    meets = squared < 1e-12
+    # Two arcs of the same circle are one: the line between them has no direction.
+    meets = squared < (_SAME * radius) ** 2
     straight = jnp.sqrt(jnp.where(left > 1e-12, left, 1e-12))
     bearing = jnp.arctan2(jnp.where(meets, jnp.sin(a0), dy), jnp.where(meets, jnp.cos(a0), dx))
     line = bearing + crossing * jnp.arctan2(2.0 * radius * jnp.ones_like(straight), straight)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from wlplan.errors import InputError
-from wlplan.planning.way import Room, room_of, way_to
+from wlplan.planning.way import Room, lane_touching, room_of, way_to
 from wlplan.planning.yard import CLEARED, standing, yard_of
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
@@ -162,7 +162,11 @@ def _best(
     ways = [
         np.asarray(
             _mean_ways(
-                jnp.asarray(places[part], dtype), jnp.asarray(nearest[part], dtype), room, machine
+                jnp.asarray(places[part], dtype),
+                jnp.asarray(nearest[part], dtype),
+                pile,
+                room,
+                machine,
             )
         )
         for part in rows.reshape(-1, _BATCH)
@@ -174,28 +178,34 @@ def _best(
 
 @functools.partial(jax.jit, static_argnames="machine")
 def _mean_ways(
-    places: Float[Array, "n 3"], poses: Float[Array, "n m 3"], room: Room, machine: WheelLoader
+    places: Float[Array, "n 3"],
+    poses: Float[Array, "n m 3"],
+    pile: Pile,
+    room: Room,
+    machine: WheelLoader,
 ) -> Float[Array, " n"]:
     """What the ways from poses to receivers cost in the mean [m]."""
 
-    def one(place: Array, pose: Array) -> Array:
-        length, touching, _ = way_to(Pose(*pose), Receiver(*place), room, machine)
-        return length + _TOUCHING * touching
+    def one(place: Array, at: Array) -> Array:
+        pose, receiver = Pose(*at), Receiver(*place)
+        length, touching, _ = way_to(pose, receiver, room, machine)
+        lane = lane_touching(pose, receiver, pile, room.yard, machine)
+        return length + _TOUCHING * (touching + lane)
 
     each = jax.vmap(jax.vmap(one, in_axes=(None, 0)))(places, poses)
     return each.mean(axis=1)
 
 
 def truck_cells(
-    place: Float[np.ndarray, "... 3"], machine: WheelLoader
-) -> tuple[Float[np.ndarray, "... n"], Float[np.ndarray, "... n"]]:
+    places: Float[np.ndarray, "n 3"], machine: WheelLoader
+) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
     """X and y of points all over the truck that belongs to receivers [m]."""
     near, far, half = truck_outline(machine)
     ahead, left = (
         a.ravel()
         for a in np.meshgrid(np.linspace(near, far, 7), np.linspace(-half, half, 15), indexing="ij")
     )
-    x, y, heading = (place[..., k, None] for k in range(3))
+    x, y, heading = (places[:, k, None] for k in range(3))
     return (
         x + ahead * np.cos(heading) - left * np.sin(heading),
         y + ahead * np.sin(heading) + left * np.cos(heading),
@@ -213,13 +223,13 @@ def _cost_of_truck(
 
 
 def truck_stands_on(
-    place: Float[np.ndarray, "... 3"],
+    places: Float[np.ndarray, "n 3"],
     pile: Pile,
     blocked: Bool[np.ndarray, "nx ny"],
     machine: WheelLoader,
-) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Which part of the truck of receivers stands on blocked cells, and which on unseen ground."""
-    x, y = truck_cells(place, machine)
+    x, y = truck_cells(places, machine)
     origin, shape = np.asarray(pile.origin, float), pile.height.shape
     i, j = (np.rint((v - origin[k]) / pile.cell_size) for k, v in enumerate((x, y)))
     inside = (i >= 0) & (j >= 0) & (i < shape[0]) & (j < shape[1])

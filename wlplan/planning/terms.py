@@ -58,7 +58,7 @@ class CycleWork:
 
 def touching(loading: Loading) -> Float[Array, ""]:
     """Metres of the way and of the approach lane that lead through what must not be touched."""
-    return loading.transport.touching
+    return jnp.asarray(loading.transport.touching)
 
 
 TERMS: dict[str, Term] = {

@@ -37,8 +37,9 @@ def transport(
         whose length is that of the time and the work to a centimetre or so, see `way_to`.
     """
     machine = site.machine
-    length, touching, way = way_to(pose, site.placed_receiver, room, machine)
-    lane = lane_touching(pose, pile, room.yard, machine)
+    receiver = site.placed_receiver
+    length, touching, way = way_to(pose, receiver, room, machine)
+    lane = lane_touching(pose, receiver, pile, room.yard, machine)
     speed = machine.travel_speed
     # There and back; two changes of direction each way.
     time = 2.0 * length / speed + 4.0 * SHIFT_TIME + DUMP_TIME

@@ -151,7 +151,7 @@ def _search(start: _Place, goal: _Place, room: Room, machine: WheelLoader) -> _C
 
     def one(best: tuple[_Cusps, Array], number: Array) -> tuple[tuple[_Cusps, Array], None]:
         (local, at_start), costs = best
-        around = (local[:, None] + scales[number] * places[None]).reshape(-1, 3)
+        around = (local[:, None] + (scales[number][None] * places)[None]).reshape(-1, 3)
         tried = _Cusps(
             jnp.where(number < 2, fan, around),
             jnp.where(number < 2, number == 0, jnp.repeat(at_start, _BEST)),
@@ -238,7 +238,7 @@ def _ways(
 
     def discs(front: float) -> tuple[Array, Array]:
         ahead = jnp.asarray([-third, 0.0, front], x.dtype)[:, None, None]
-        return x + ahead * c, y + ahead * s
+        return x[None] + ahead * c[None], y[None] + ahead * s[None]
 
     look = depth_at if smooth else depth_near
     depth = look(room.field, *discs(third))
@@ -299,16 +299,24 @@ def _looks(curve: Curve, radius: float) -> tuple[Array, ...]:
 
 def _depth_in_truck(x: Array, y: Array, goal: _Place, reach: float, machine: WheelLoader) -> Array:
     """How deep discs are in the truck, as `Depths.depth`."""
+    return jnp.maximum(1.0 - _truck_distance(x, y, goal, machine) / reach, 0.0)
+
+
+def _truck_distance(x: Array, y: Array, goal: _Place, machine: WheelLoader) -> Array:
+    """Distance to the outline of the truck [m]; next to nothing inside it."""
     near, far, half = truck_outline(machine)
     c, s = jnp.cos(goal[2]), jnp.sin(goal[2])
     dx, dy = x - goal[0], y - goal[1]
     across = jnp.abs(c * dx + s * dy - 0.5 * (near + far)) - 0.5 * (far - near)
     along = jnp.abs(c * dy - s * dx) - half
     apart = jnp.maximum(across, 0.0) ** 2 + jnp.maximum(along, 0.0) ** 2
-    return jnp.maximum(1.0 - jnp.sqrt(apart + 1e-6) / reach, 0.0)
+    # The square root has no derivative at zero.
+    return jnp.sqrt(apart + 1e-6)
 
 
-def lane_touching(pose: Pose, pile: Pile, yard: Yard, machine: WheelLoader) -> Float[Array, ""]:
+def lane_touching(
+    pose: Pose, receiver: Receiver, pile: Pile, yard: Yard, machine: WheelLoader
+) -> Float[Array, ""]:
     """Length of the approach lane in which something stands that cannot be driven over [m].
 
     The lane is as wide as the bucket and runs straight to the dig location, from where the rear of
@@ -316,6 +324,7 @@ def lane_touching(pose: Pose, pile: Pile, yard: Yard, machine: WheelLoader) -> F
 
     Args:
         pose: Dig location and heading.
+        receiver: Whose truck must not stand there either.
         pile: The pile as it is.
         yard: What stands still there.
         machine: What drives.
@@ -328,7 +337,9 @@ def lane_touching(pose: Pose, pile: Pile, yard: Yard, machine: WheelLoader) -> F
     left = machine.bucket_width * ((np.arange(columns) + 0.5) / columns - 0.5)
     x, y = to_world(pose, *jnp.meshgrid(along, jnp.asarray(left, dtype), indexing="ij"))
     soil = jnp.clip((sample(pile.height - pile.floor, pile, x, y) - CLEARED) / _LANE_RAMP, 0.0, 1.0)
-    most = jnp.maximum(soil, is_standing(yard, x, y)).max(axis=1)
+    goal = receiver.x, receiver.y, receiver.heading
+    truck = jnp.clip(1.0 - _truck_distance(x, y, goal, machine) / _LANE_RAMP, 0.0, 1.0)
+    most = jnp.maximum(jnp.maximum(soil, truck), is_standing(yard, x, y)).max(axis=1)
     return most.sum() * (last - first) / rows
 
 
