@@ -14,8 +14,7 @@ from precision import in_float64
 
 import wlplan
 from wlplan.engines.simulator import Simulator
-from wlplan.planning.job import Job, play_candidate
-from wlplan.planning.objective import objective_of
+from wlplan.planning.job import make_job, play_candidate
 from wlplan.planning.rollout import closed_loop, rollout
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
@@ -217,7 +216,7 @@ def test_the_simulator_rolls_out_under_the_same_signature(
 def cost_in(world: World, pile: Pile) -> Callable[[LoadingPlan], jax.Array]:
     """The objective of a plan, transport included."""
     receiver = Receiver(*(jnp.asarray(v, pile.height.dtype) for v in (-18.0, -3.0, -0.5)))
-    job = Job(world, pile, Site(receiver=receiver), objective_of("efficiency"))
+    job = make_job(world, pile, site=Site(receiver=receiver))
     return lambda plan: play_candidate(job, plan, report=False).cost
 
 

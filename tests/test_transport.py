@@ -28,7 +28,8 @@ def _drive(mass: jax.Array, receiver: Receiver) -> tuple[Transport, Way]:
 
 def drive(mass: float, x: float = -9.0) -> tuple[Transport, Way]:
     receiver = Receiver(*(jnp.float32(v) for v in (x, 4.0, 1.3)))
-    return _drive(jnp.float32(mass), receiver)
+    found: tuple[Transport, Way] = _drive(jnp.float32(mass), receiver)
+    return found
 
 
 def test_time_and_work_by_hand() -> None:

@@ -11,9 +11,10 @@ from laws import assert_gradient
 from wlplan.planning.clearance import FARTHEST, clearance
 from wlplan.planning.placement import best_receiver, place_receiver, truck_stands_on
 from wlplan.planning.way import Room, Way, lane_touching, points_of, room_of, way_to
-from wlplan.planning.yard import Yard, packed_soil, standing, unpacked_soil, yard_of
+from wlplan.planning.yard import Yard, packed_soil, unpacked_soil, yard_of
 from wlplan.site.machine import WA320
 from wlplan.site.receiver import Receiver, truck_outline
+from wlplan.terrain.standing import standing
 from wlplan.types import Pile, Pose
 
 Place = tuple[float, float, float]  # x [m], y [m], heading [rad]
@@ -255,12 +256,12 @@ def test_ridges_in_the_lane_count_by_their_length() -> None:
 def test_what_stands_counts_where_soil_does_not() -> None:
     box = field((1.0, 0.8, 3.0, 1.2))
     wall = box.replace(ground=box.height)
-    assert standing(wall).sum() == (np.asarray(box.height) > 0).sum()
+    assert standing(np.asarray(wall.floor), 0.1).sum() == (np.asarray(box.height) > 0).sum()
     assert lane(wall) == pytest.approx(2.0, abs=0.5)
     # A yard that slopes is no wall, nor is one that is level.
     slope = 0.15 * np.arange(CELLS)[:, None] * 0.1 * np.ones((1, CELLS), np.float32)
-    assert not standing(OPEN.replace(height=jnp.asarray(slope), ground=jnp.asarray(slope))).any()
-    assert not standing(OPEN).any()
+    assert not standing(slope, 0.1).any()
+    assert not standing(np.asarray(OPEN.floor), 0.1).any()
 
 
 def test_soil_is_packed_without_loss() -> None:

@@ -381,6 +381,26 @@ READING = {
         help="Floor under the pile: its level [m], in the heights of the scan, or a scan of it in "
         "the same coordinates. Default: estimated from the ground around the pile.",
     ),
+    "pile": click.option(
+        "--pile",
+        type=Numbers("X,Y", 2),
+        default=None,
+        help="Which of several piles is meant: a place on it [m], in the coordinates of the scan. "
+        "Default: the largest.",
+    ),
+    "keep_out": click.option(
+        "--keep-out",
+        metavar="FILE.geojson",
+        default=None,
+        help="Polygons in the coordinates of the scan: obstacles, or by their property kind no-go "
+        "or no-dig.",
+    ),
+    "include": click.option(
+        "--include",
+        type=Numbers("X,Y", 2),
+        default=None,
+        help="A place on a structure that is soil after all [m], in the coordinates of the scan.",
+    ),
 }
 """Options of how a pile is read, by the argument of `wlplan.io.read_scan` that each gives."""
 

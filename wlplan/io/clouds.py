@@ -21,6 +21,7 @@ from wlplan.io.overview import coarse_cell, where_piles_are
 from wlplan.io.scans import Heightmap, PointCloud, check_size, real_numbers
 from wlplan.io.sensor import NEAR, at_sensor
 from wlplan.terrain.floor import fill_unseen
+from wlplan.terrain.standing import lower_envelope
 
 # A point cloud is gridded at this many times its mean spacing where that is more than a cell: two
 # points a cell leave few cells empty.
@@ -35,7 +36,10 @@ _GAP, _SMALL = 3, 0.01
 # Points of a patch of so many cells a side that are this far above the next lower one belong to
 # another layer [m], if those below are at least this part and so many of the patch's: a roof, a
 # conveyor, a branch. Fewer are noise.
-_PATCH, _LAYERS, _LOWER, _FEW = 5, 1.0, 0.2, 3
+_PATCH, _LAYERS, _LOWER, _FEW = 5, 1.0, 0.05, 3
+# Where nothing was seen below an upper layer, it is one if it hangs so near [m], over a drop as
+# steep as this [degrees]; and the highest drop that is looked for [m].
+_NEARBY, _DROP, _TALLEST = 1.0, 60.0, 12.0
 # Lines of coordinates that lie this many times the mean spacing apart come from rounding, and up to
 # this distance it does no harm [m]. Within this part of the spacing they are a regular grid.
 _ROUNDED, _HARMLESS, _REGULAR = 3.0, 0.25, 0.1
@@ -71,9 +75,11 @@ def grid_points(cloud: PointCloud) -> Heightmap:
     # Points on a regular grid land amid the cells, not on their borders.
     shape = tuple(int(n) for n in np.rint(extent / cell) + 1)
     check_size(shape, cell, lambda: _overview(cloud, kept, low, extent))
-    height, hanging = _medians(cloud, kept, low, cell, shape)
+    height, hanging, upper = _medians(cloud, kept, low, cell, shape)
     layers = (f"{hanging} points hang over others: the lower ones count",) if hanging else ()
     seen = np.isfinite(height)
+    if hanging:
+        seen &= ~_of_upper_layer(height, upper, cell)
     padded = ndimage.binary_closing(np.pad(seen, 1), np.ones((3, 3), bool))[1:-1, 1:-1]
     height = fill_unseen(height, seen)
     notes = (*cloud.notes, *returns, *strays, *rounded, *layers)
@@ -265,13 +271,14 @@ def _medians(
     low: Float[np.ndarray, "2"],
     cell: float,
     shape: tuple[int, ...],
-) -> tuple[Float[np.ndarray, "nx ny"], int]:
+) -> tuple[Float[np.ndarray, "nx ny"], int, Float[np.ndarray, "nx ny"]]:
     """The median height of the lower layer in each cell [m], NaN in empty ones.
 
     Returns:
-        The map, and how many points belong to upper layers.
+        The map, how many points belong to upper layers, and the lowest of these in each cell [m],
+        NaN where there is none.
     """
-    height = np.full(shape, np.nan)
+    height, upper = np.full(shape, np.nan), np.full(shape, np.nan)
     hanging = 0
     # A cell reaches half into the next patch: its points wait for the next strip.
     index, z = np.empty(0, np.int64), np.empty(0)
@@ -280,6 +287,8 @@ def _medians(
         patches = np.floor((places[:, :2] - low) / (_PATCH * cell)).astype(np.int64)
         lower = _lower_layer(patches[:, 0] * shape[1] + patches[:, 1], places[:, 2])
         hanging += int((~lower).sum())
+        over = np.rint((places[~lower, :2] - low) / cell).astype(np.int64)
+        np.fmin.at(upper, (over[:, 0], over[:, 1]), places[~lower, 2])
         places = places[lower]
         cells = np.rint((places[:, :2] - low) / cell).astype(np.int64)
         index = np.concatenate([index, cells[:, 0] * shape[1] + cells[:, 1]])
@@ -288,7 +297,30 @@ def _medians(
         _put_medians(height, index[complete], z[complete])
         index, z = index[~complete], z[~complete]
     _put_medians(height, index, z)
-    return height, hanging
+    return height, hanging, upper
+
+
+def _of_upper_layer(
+    height: Float[np.ndarray, "nx ny"], upper: Float[np.ndarray, "nx ny"], cell: float
+) -> Bool[np.ndarray, "nx ny"]:
+    """Cells in which only an upper layer was seen: as high as it hangs nearby, and over a drop.
+
+    Args:
+        height: Of the lowest layer in each cell [m], NaN in empty ones.
+        upper: Of the layers above [m], NaN where there is none.
+        cell: Grid spacing [m].
+    """
+    size = 2 * max(1, round(_NEARBY / cell)) + 1
+    hangs = np.isfinite(upper)
+    low = ndimage.grey_erosion(np.where(hangs, upper, np.inf), size=(size, size))
+    high = ndimage.grey_dilation(np.where(hangs, upper, -np.inf), size=(size, size))
+    surface = np.where(np.isfinite(height), height, np.inf)
+    rise = math.tan(math.radians(_DROP)) * cell
+    below = lower_envelope(surface, rise, math.ceil(_TALLEST / rise))
+    with np.errstate(invalid="ignore"):
+        over = surface - below > _LAYERS
+        found: np.ndarray = over & (height > low - 0.5 * _LAYERS) & (height < high + 0.5 * _LAYERS)
+    return found
 
 
 def _put_medians(

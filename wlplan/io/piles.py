@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 from wlplan.constants import CELL_SIZE
 from wlplan.errors import InputError, one_line
 from wlplan.io.clouds import grid_points
+from wlplan.io.contents import Contents, contents_of
 from wlplan.io.files import check_is_file, named, write_bytes_atomic
 from wlplan.io.floors import floor_of
 from wlplan.io.overview import averaged, coarse_cell, where_piles_are
@@ -32,7 +33,7 @@ from wlplan.io.readers import find_reader
 from wlplan.io.scans import Heightmap, PointCloud, Scan, check_size, corners, crop, real_numbers
 from wlplan.io.upright import upright
 from wlplan.site.frame import Frame
-from wlplan.terrain.floor import estimate_ground, fill_unseen
+from wlplan.terrain.floor import fill_unseen
 from wlplan.terrain.resampling import resample
 from wlplan.types import Pile
 from wlplan.xla import floats
@@ -44,6 +45,8 @@ _FARTHEST = 1.0e8
 # Coordinates above which whole kilometres, and heights above which whole hundreds of metres, are
 # taken off [m]: float32 resolves 1 mm at the one and 0.01 mm at the other.
 _FAR = 10_000.0
+# Options that say what a scan holds, see `contents_of`.
+_OF_CONTENTS = ("keep_out", "include", "pile")
 # Slope of the ground as a whole above which a note says so [degrees].
 _SLOPING = 5.0
 _HIGH = 100.0
@@ -65,11 +68,13 @@ class ScannedPile:
         pile: The pile, on the grid of the models, in its local frame.
         frame: How that lies to the coordinates of the file, and their reference system.
         notes: What was assumed, converted or left out, in words: sentences without their stops.
+        contents: Structures, piles and areas; the ground of the pile holds all that is not dug.
     """
 
     pile: Pile
     frame: Frame
     notes: tuple[str, ...]
+    contents: Contents
 
 
 def read_pile(
@@ -126,7 +131,9 @@ def read_scan(
             coordinates of the file. `up`, the axis of a point cloud or mesh that is up, such as
             "y", which is turned to be z before anything else, the crop too. Others are for the
             reader of the format, which names them in `OPTIONS`: `band` of a GeoTIFF, `layer` of a
-            grid_map.
+            grid_map. And, in the coordinates of the scan in metres, `keep_out`, a GeoJSON file of
+            areas; `include`, x and y of a structure that is soil; `pile`, x and y of the pile that
+            is dug, by default the largest; asked for, it is the only one that is soil.
 
     Returns:
         The pile on the 0.1 m grid, with its ground, and the notes.
@@ -135,13 +142,15 @@ def read_scan(
         InputError: If the file cannot be used; one line that says why and what to do.
     """
     path = Path(path)
+    of_contents = {name: options.pop(name) for name in _OF_CONTENTS if name in options}
     scan = _heights(path, options)
     floor: Any = ground
     if isinstance(ground, str | os.PathLike):
         floor = _ground_scan(Path(ground), scan, path, options)
     with named(path):
-        pile, frame, notes = _to_pile(scan, floor)
-        return ScannedPile(pile, frame, (*scan.notes, *notes, *_sloping(pile)))
+        pile, frame, contents, notes = _to_pile(scan, floor, of_contents)
+        notes = (*scan.notes, *notes, *_sloping(contents.floor, CELL_SIZE), *contents.notes)
+        return ScannedPile(pile, frame, notes, contents)
 
 
 def _heights(path: Path, options: Mapping[str, Any]) -> Heightmap:
@@ -219,10 +228,10 @@ def _ground_scan(
     return path, dataclasses.replace(ground, valid=seen)
 
 
-def _sloping(pile: Pile) -> tuple[str, ...]:
+def _sloping(floor: Float[np.ndarray, "nx ny"], cell_size: float) -> tuple[str, ...]:
     """A note where the ground as a whole slopes more than yards do."""
-    ground = np.asarray(pile.floor, np.float64)
-    axes = [np.linspace(-0.5 * n, 0.5 * n, n) * pile.cell_size for n in ground.shape]
+    ground = np.asarray(floor, np.float64)
+    axes = [np.linspace(-0.5 * n, 0.5 * n, n) * cell_size for n in ground.shape]
     # Least squares on a grid: the axes are apart from each other.
     rises = [(axes[k] * ground.mean(axis=1 - k)).sum() / (axes[k] ** 2).sum() for k in (0, 1)]
     slope = math.degrees(math.atan(math.hypot(*rises)))
@@ -232,9 +241,11 @@ def _sloping(pile: Pile) -> tuple[str, ...]:
 
 
 def _to_pile(
-    scan: Heightmap, ground: Array | np.ndarray | float | tuple[Path, Heightmap] | None
-) -> tuple[Pile, Frame, tuple[str, ...]]:
-    """Check a scan, fill its gaps, resample it and find its ground; with notes of the latter."""
+    scan: Heightmap,
+    ground: Array | np.ndarray | float | tuple[Path, Heightmap] | None,
+    of_contents: Mapping[str, Any],
+) -> tuple[Pile, Frame, Contents, tuple[str, ...]]:
+    """Check a scan, fill its gaps, resample it and find what it holds; with notes of its floor."""
     height, origin = real_numbers("height", scan.height), real_numbers("origin", scan.origin)
     if height.ndim != 2:
         raise InputError(f"`height` has shape {height.shape}: it has to be 2-D, x by y.")
@@ -288,6 +299,7 @@ def _to_pile(
     centre = origin + 0.5 * scan.cell_size * np.array(shape)
     offset = np.where(np.abs(centre) > _FAR, 1000.0 * np.floor(centre / 1000.0), 0.0)
     sea_level = 100.0 * math.floor(low / 100.0) if abs(low) > _HIGH else 0.0
+    frame = Frame((float(offset[0]), float(offset[1]), sea_level), scan.crs)
     pile = resample(
         Pile(
             height=floats(height - sea_level),
@@ -298,18 +310,24 @@ def _to_pile(
         ),
         CELL_SIZE,
     )
-    if floor is None or not known_floor.all():
-        found = floats(estimate_ground(pile.height, CELL_SIZE, pile.valid))
-        estimated = jnp.minimum(found, pile.height)
-        if floor is not None:
-            whole = Pile(
-                height=floats(floor), cell_size=scan.cell_size, valid=jnp.asarray(known_floor)
-            )
-            given = np.asarray(resample(whole, CELL_SIZE).valid)
-            estimated = jnp.where(given, pile.floor, estimated)
-        pile = pile.replace(ground=estimated)
-    frame = Frame((float(offset[0]), float(offset[1]), sea_level), scan.crs)
-    return pile.replace(cell_size=CELL_SIZE), frame, notes
+    given = None
+    if floor is not None and not known_floor.all():
+        whole = Pile(height=floats(floor), cell_size=scan.cell_size, valid=jnp.asarray(known_floor))
+        given = np.asarray(resample(whole, CELL_SIZE).valid)
+    contents = contents_of(
+        np.asarray(pile.height, np.float64),
+        None if pile.ground is None else np.asarray(pile.ground, np.float64),
+        None if pile.valid is None else np.asarray(pile.valid),
+        CELL_SIZE,
+        np.asarray(pile.origin, np.float64),
+        frame,
+        known_ground=given,
+        **of_contents,
+    )
+    surface = floats(contents.height)
+    lowered = jnp.minimum(floats(contents.ground), surface)
+    pile = pile.replace(height=surface, ground=lowered, cell_size=CELL_SIZE)
+    return pile, frame, contents, notes
 
 
 def _overview(

@@ -13,13 +13,14 @@ from jaxtyping import Array, Bool, Float
 
 from wlplan.errors import InputError
 from wlplan.planning.way import Room, lane_touching, room_of, way_to
-from wlplan.planning.yard import CLEARED, standing, yard_of
+from wlplan.planning.yard import yard_of
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.presets import check_machine, check_soil
 from wlplan.site.receiver import Receiver, truck_outline
 from wlplan.site.site import Site
 from wlplan.terrain.heightmap import sample
+from wlplan.terrain.standing import CLEARED, standing
 from wlplan.terrain.toe import ToeContour, edge_poses, toe_contour
 from wlplan.types import Pile, Pose
 
@@ -217,7 +218,9 @@ def _cost_of_truck(
 ) -> Float[np.ndarray, " n"]:
     """What it costs that a truck stands on something or on unseen ground [m]."""
     blocked = np.asarray(pile.height - pile.floor) > CLEARED
-    on, unseen = truck_stands_on(places, pile, blocked | standing(pile), machine)
+    on, unseen = truck_stands_on(
+        places, pile, blocked | standing(np.asarray(pile.floor), pile.cell_size), machine
+    )
     cost: np.ndarray = _TRUCK_ON * on + _TRUCK_UNSEEN * unseen
     return cost
 

@@ -28,7 +28,6 @@ from jaxtyping import Array, Bool, Float
 from wlplan.planning import dubins
 from wlplan.planning.dubins import WORDS, Curve, curve_between
 from wlplan.planning.yard import (
-    CLEARED,
     Depths,
     Yard,
     depth_at,
@@ -40,6 +39,7 @@ from wlplan.planning.yard import (
 from wlplan.site.machine import WheelLoader
 from wlplan.site.receiver import Receiver, truck_outline
 from wlplan.terrain.heightmap import sample, to_world
+from wlplan.terrain.standing import CLEARED
 from wlplan.types import Pile, Pose
 from wlplan.xla import materialize
 
@@ -52,8 +52,8 @@ _TWICE = ((35.0, 70.0), (0.0, 4.0), (0.0, 40.0, 80.0, 120.0))
 # each to as many places around as there are of them, which makes a round as large as the fan.
 _ROUNDS = ((2.0, 0.45), (0.7, 0.15))
 _BEST = 11
-# Places on each arc and on each line where the loader is looked at.
-_ON_ARC, _ON_LINE = 3, 6
+# Places on each of the two curves where the loader is looked at.
+_LOOKS = 14
 # Metres of way that one metre in the middle of an obstacle is worth: no way around is longer.
 _DETOUR = 20.0
 # The lane is looked at in steps of this length, and soil this much higher than can be driven over
@@ -264,37 +264,23 @@ def _shortest(start: _Place, end: _Place, radius: float) -> Curve:
 
 def _looks(curve: Curve, radius: float) -> tuple[Array, ...]:
     """Places along curves: x, y, cosine and sine of the heading, and the length each stands for."""
-    dtype = curve.x.dtype
-    on_arc, on_line = (
-        jnp.asarray((np.arange(n) + 0.5) / n, dtype)[None] for n in (_ON_ARC, _ON_LINE)
+    heading, first, straight, last = (
+        leaf[:, None] for leaf in (curve.heading, curve.first, curve.straight, curve.last)
     )
-
-    def along_arc(x: Array, y: Array, heading: Array, turn: Array) -> tuple[Array, ...]:
-        side = jnp.where(turn < 0.0, -radius, radius)[:, None]
-        there = heading[:, None] + turn[:, None] * on_arc
-        c, s = jnp.cos(there), jnp.sin(there)
-        c0, s0 = jnp.cos(heading)[:, None], jnp.sin(heading)[:, None]
-        weight = jnp.broadcast_to((radius / _ON_ARC * jnp.abs(turn))[:, None], c.shape)
-        return x[:, None] + side * (s - s0), y[:, None] - side * (c - c0), c, s, weight
-
-    x, y, line = dubins.arc(curve.x, curve.y, curve.heading, curve.first, radius)
-    c, s = jnp.cos(line)[:, None], jnp.sin(line)[:, None]
-    distance = curve.straight[:, None] * on_line
-    ones = jnp.ones_like(distance)
-    parts = (
-        along_arc(curve.x, curve.y, curve.heading, curve.first),
-        (
-            x[:, None] + distance * c,
-            y[:, None] + distance * s,
-            ones * c,
-            ones * s,
-            ones * (curve.straight / _ON_LINE)[:, None],
-        ),
-        along_arc(
-            x + curve.straight * jnp.cos(line), y + curve.straight * jnp.sin(line), line, curve.last
-        ),
-    )
-    return tuple(jnp.concatenate(leaves, axis=1) for leaves in zip(*parts, strict=True))
+    length = dubins.length_of(curve, radius)[:, None]
+    distance = length * jnp.asarray((np.arange(_LOOKS) + 0.5) / _LOOKS, length.dtype)[None]
+    arc = radius * jnp.abs(first)
+    # The heading on the first arc, or at its end; and then on the last one.
+    turned = heading + jnp.sign(first) * jnp.minimum(distance, arc) / radius
+    there = turned + jnp.sign(last) * jnp.maximum(distance - arc - straight, 0.0) / radius
+    on_line = jnp.clip(distance - arc, 0.0, straight)
+    side, other = radius * jnp.sign(first), radius * jnp.sign(last)
+    c1, s1, c, s = jnp.cos(turned), jnp.sin(turned), jnp.cos(there), jnp.sin(there)
+    line = heading + first
+    x = curve.x[:, None] + side * (s1 - jnp.sin(heading)) + on_line * jnp.cos(line)
+    y = curve.y[:, None] - side * (c1 - jnp.cos(heading)) + on_line * jnp.sin(line)
+    weight = jnp.broadcast_to(length / _LOOKS, c.shape)
+    return x + other * (s - s1), y - other * (c - c1), c, s, weight
 
 
 def _depth_in_truck(x: Array, y: Array, goal: _Place, reach: float, machine: WheelLoader) -> Array:

@@ -18,22 +18,15 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, UInt8
 
 from wlplan.site.machine import WheelLoader
+from wlplan.terrain.standing import CLEARED, pooled, standing
 from wlplan.types import Pile
 from wlplan.xla import floats
-
-CLEARED = 0.25
-"""What stands higher over the floor than this cannot be driven over [m]. Estimate: the belly of a
-loader of the class clears 0.4 m, its tyres climb less when laden."""
 
 # Cells of the yard come in multiples of so many along each side: what is compiled for one pile
 # serves the next.
 _BLOCK = 32
 # Cells of the pile that make one of the yard, along each side: 0.3 m.
 _COARSE = 3
-# A floor steeper than this is none: what rises faster stands on it [degrees].
-_STEEPEST_FLOOR = 15.0
-# How far the floor is looked for under what stands [m]: half the width of a large building.
-_SEARCHED = 12.0
 
 
 @no_type_check
@@ -65,16 +58,20 @@ def yard_of(
     reach = disc_radius(machine)
     cell = pile.cell_size * _COARSE
     border = _border(reach, cell)
-    stands = standing(pile)
+    stands = standing(np.asarray(pile.floor), pile.cell_size)
     if closed is not None:
         stands = stands | closed
     unseen = np.zeros_like(stands) if pile.valid is None else ~np.asarray(pile.valid)
     middle = 0.5 * (_COARSE - 1) * pile.cell_size
     origin = np.asarray(pile.origin, np.float64) + middle - border * cell
-    width = [(border, border + (-n - 2 * border) % _BLOCK) for n in _any_pooled(stands).shape]
+
+    def flags(cells: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "n m"]:
+        return pooled(cells.astype(np.int8), _COARSE) > 0
+
+    width = [(border, border + (-n - 2 * border) % _BLOCK) for n in flags(stands).shape]
     return Yard(
-        standing=jnp.asarray(np.pad(_any_pooled(stands), width)),
-        unseen=jnp.asarray(np.pad(_any_pooled(unseen), width, constant_values=True)),
+        standing=jnp.asarray(np.pad(flags(stands), width)),
+        unseen=jnp.asarray(np.pad(flags(unseen), width, constant_values=True)),
         origin=floats(origin),
         cell=cell,
         reach=reach,
@@ -84,49 +81,6 @@ def yard_of(
 def _border(reach: float, cell: float) -> int:
     """Cells around the map in which a disc may still touch what is in it."""
     return math.ceil(reach / cell) + 1
-
-
-def standing(pile: Pile) -> Bool[np.ndarray, "nx ny"]:
-    """Cells whose ground stands higher over the floor around it than can be driven over.
-
-    The floor is the highest surface below the ground that slopes no more than floors do.
-    """
-    ground = np.asarray(pile.floor, np.float64)
-    if np.ptp(ground) <= CLEARED:
-        return np.zeros(ground.shape, bool)
-    step = pile.cell_size * _COARSE
-    low = -_pooled(-ground)
-    slope = math.tan(math.radians(_STEEPEST_FLOOR))
-    for _ in range(math.ceil(_SEARCHED / step)):
-        before = low
-        for (di, dj), apart in _NEIGHBOURS:
-            padded = np.pad(before, 1, mode="edge")
-            shifted = padded[1 + di : 1 + di + low.shape[0], 1 + dj : 1 + dj + low.shape[1]]
-            low = np.minimum(low, shifted + slope * step * apart)
-        if np.array_equal(low, before):
-            break
-    floor = low.repeat(_COARSE, axis=0).repeat(_COARSE, axis=1)
-    floor = floor[: ground.shape[0], : ground.shape[1]]
-    stands: np.ndarray = ground - floor > CLEARED + slope * step
-    return stands
-
-
-_NEIGHBOURS = [
-    ((i, j), math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
-]
-
-
-def _pooled(values: np.ndarray) -> np.ndarray:
-    """Largest value of each coarse cell; the last ones may be cut short."""
-    nx, ny = values.shape
-    grown = np.pad(values, ((0, -nx % _COARSE), (0, -ny % _COARSE)), mode="edge")
-    nx, ny = (n // _COARSE for n in grown.shape)
-    largest: np.ndarray = grown.reshape(nx, _COARSE, ny, _COARSE).max(axis=(1, 3))
-    return largest
-
-
-def _any_pooled(flags: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "n m"]:
-    return _pooled(flags.astype(np.int8)) > 0
 
 
 @no_type_check
@@ -143,6 +97,10 @@ def depths(yard: Yard, pile: Pile) -> Depths:
     border = _border(yard.reach, yard.cell)
     soil = _most(lax.stop_gradient(pile.height - pile.floor))
     sizes = zip(yard.standing.shape, soil.shape, strict=True)
+
+    def flags(cells: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "n m"]:
+        return pooled(cells.astype(np.int8), _COARSE) > 0
+
     width = [(border, whole - part - border) for whole, part in sizes]
     blocked = jnp.pad(soil > CLEARED, width) | yard.standing
     steps = math.ceil(yard.reach / yard.cell)

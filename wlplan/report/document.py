@@ -16,10 +16,11 @@ from wlplan.io.plans import plan_to_dict
 from wlplan.planning.clearance import clearance
 from wlplan.planning.job import PlanResult
 from wlplan.planning.way import points_of
-from wlplan.planning.yard import standing, unpacked_soil
+from wlplan.planning.yard import unpacked_soil
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
 from wlplan.site.soil import Soil
+from wlplan.terrain.standing import standing
 from wlplan.types import Performance, Pile, SolveReport
 
 RECEIVER_FIELDS = tuple(field.name for field in dataclasses.fields(Receiver))
@@ -85,7 +86,7 @@ def paths_of(before: Pile, played: PlanResult, site: Site) -> list[dict[str, Any
     assert played.ways is not None
     machine, receiver = site.machine, receiver_fields(site.placed_receiver)
     to = np.array([receiver[name] for name in RECEIVER_FIELDS])
-    stands, found = standing(before), []
+    stands, found = standing(np.asarray(before.floor), before.cell_size), []
     ways = jax.tree.map(lambda leaf: np.asarray(leaf), played.ways)
     pose = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(played.plan.pose)]
     for n in range(len(pose[0])):

@@ -62,6 +62,7 @@ def estimate_ground(
     height: Float[Array | np.ndarray, "nx ny"],
     cell_size: float,
     valid: Bool[Array | np.ndarray, "nx ny"] | None = None,
+    standing: Bool[np.ndarray, "nx ny"] | None = None,
 ) -> Float[np.ndarray, "nx ny"]:
     """Estimate the floor under a scanned pile from the ground around its toe.
 
@@ -75,14 +76,21 @@ def estimate_ground(
         height: Surface [m].
         cell_size: Grid spacing [m].
         valid: Cells that the scan saw; the others are filled first and start no ground.
+        standing: Cells of what is neither ground nor pile; filled likewise, but no edge of the map.
 
     Returns:
         The ground [m], float64, nowhere above the (filled) surface. Where no ground is in sight,
         because the pile runs over every edge of the map, it is level at the lowest cell.
     """
     seen = np.ones(np.shape(height), bool) if valid is None else np.asarray(valid)
+    edge = seen & ~ndimage.binary_erosion(seen)
+    if standing is not None and (seen & ~standing).any():
+        seen, edge = seen & ~standing, edge & ~standing
+        edge = edge if edge.any() else seen & ~ndimage.binary_erosion(seen)
     surface = fill_unseen(height, seen)
-    footprint, land = _footprint(surface, cell_size, seen)
+    footprint, land = _footprint(surface, cell_size, seen, edge)
+    if standing is not None:
+        footprint = footprint | standing
     if footprint.all():
         return np.full_like(surface, surface.min())
     floor = np.minimum(surface, land + _harmonic(surface - land, footprint))
@@ -90,11 +98,15 @@ def estimate_ground(
 
 
 def _footprint(
-    surface: Float[np.ndarray, "nx ny"], cell_size: float, seen: Bool[np.ndarray, "nx ny"]
+    surface: Float[np.ndarray, "nx ny"],
+    cell_size: float,
+    seen: Bool[np.ndarray, "nx ny"],
+    edge: Bool[np.ndarray, "nx ny"],
 ) -> tuple[Bool[np.ndarray, "nx ny"], Float[np.ndarray, "nx ny"]]:
-    """Cells under the pile with a skirt of ground around it, and the lie of the land [m]."""
-    # The edge is where the seen part of the map ends.
-    edge = seen & ~ndimage.binary_erosion(seen)
+    """Cells under the pile with a skirt of ground around it, and the lie of the land [m].
+
+    The edge is where the seen part of the map ends.
+    """
     land = _lie_of_the_land(surface, edge, cell_size)
     rise = surface - land
     smooth = ndimage.gaussian_filter(rise, _SMOOTHING / cell_size, mode="nearest")

@@ -14,8 +14,8 @@ from scipy import ndimage
 
 from wlplan.errors import InputError
 
-# Smallest pile that is worth a bucket [m^3], a third of a heaped one.
-_SMALLEST_VOLUME = 1.0
+SMALLEST_VOLUME = 1.0
+"""Smallest pile that is worth a bucket [m^3], a third of a heaped one."""
 
 
 def largest_outline(
@@ -114,7 +114,7 @@ def _is_one_pile(
     if (one[:, :-1] & one[:, 1:] & other[:-1] & other[1:]).any():
         return False
     size = cell * (max(higher.shape) - 2)
-    return size >= width and bool(above[higher].sum() * cell**2 >= _SMALLEST_VOLUME)
+    return size >= width and bool(above[higher].sum() * cell**2 >= SMALLEST_VOLUME)
 
 
 def _largest_alone(
@@ -135,10 +135,10 @@ def _largest_alone(
     extent = cell * max(side.stop - side.start - 2 for side in _bounds(largest))
     if extent < width:
         extent = _largest_extent(np.argwhere(largest) * cell) + cell
-    if volumes.max() < _SMALLEST_VOLUME or extent < width:
+    if volumes.max() < SMALLEST_VOLUME or extent < width:
         raise InputError(
             f"Nothing to dig: the largest pile holds {volumes.max():.2g} m^3 and is {extent:.2g} m "
-            f"long; a bucket needs {_SMALLEST_VOLUME:g} m^3 and {width:g} m."
+            f"long; a bucket needs {SMALLEST_VOLUME:g} m^3 and {width:g} m."
         )
     # What is outside is in one piece, unless there are hollows or the pile runs over the edge.
     solid = largest if ndimage.label(~largest)[1] == 1 else ndimage.binary_fill_holes(largest)

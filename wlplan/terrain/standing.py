@@ -1,0 +1,76 @@
+"""What stands on a site: ground too high over the floor around it to be driven over."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+CLEARED = 0.25
+"""What stands higher over the floor than this cannot be driven over [m]. Estimate: the belly of a
+loader of the class clears 0.4 m, its tyres climb less when laden."""
+
+# A floor steeper than this is none: what rises faster stands on it [degrees].
+_STEEPEST_FLOOR = 15.0
+# How far the floor is looked for under what stands [m], half the width of a large building, and on
+# cells of what size [m].
+_SEARCHED, _COARSE = 12.0, 0.3
+
+_NEIGHBOURS = [
+    ((i, j), math.hypot(i, j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
+]
+
+
+def standing(ground: Float[np.ndarray, "nx ny"], cell_size: float) -> Bool[np.ndarray, "nx ny"]:
+    """Cells whose ground stands higher over the floor around it than can be driven over.
+
+    The floor is the highest surface below the ground that slopes no more than floors do.
+
+    Args:
+        ground: What cannot be moved [m].
+        cell_size: Grid spacing [m].
+    """
+    ground = np.asarray(ground, np.float64)
+    if np.ptp(ground) <= CLEARED:
+        return np.zeros(ground.shape, bool)
+    times = max(1, round(_COARSE / cell_size))
+    step = times * cell_size
+    slope = math.tan(math.radians(_STEEPEST_FLOOR))
+    low = lower_envelope(-pooled(-ground, times), slope * step, math.ceil(_SEARCHED / step))
+    floor = low.repeat(times, axis=0).repeat(times, axis=1)
+    floor = floor[: ground.shape[0], : ground.shape[1]]
+    stands: np.ndarray = ground - floor > CLEARED + slope * step
+    return stands
+
+
+def lower_envelope(
+    height: Float[np.ndarray, "nx ny"], rise: float, reach: int
+) -> Float[np.ndarray, "nx ny"]:
+    """The highest surface below another one that nowhere rises faster, over eight neighbours.
+
+    Args:
+        height: Surface [m].
+        rise: Most that it rises from a cell to the next one along an axis [m].
+        reach: Cells that a low place is looked for away from a high one, at most.
+    """
+    low = height
+    for _ in range(reach):
+        padded = np.pad(low, 1, mode="edge")
+        lowest = low
+        for (i, j), apart in _NEIGHBOURS:
+            shifted = padded[1 + i : 1 + i + low.shape[0], 1 + j : 1 + j + low.shape[1]]
+            lowest = np.minimum(lowest, shifted + rise * apart)
+        if np.array_equal(lowest, low):
+            break
+        low = lowest
+    return low
+
+
+def pooled(values: np.ndarray, times: int) -> np.ndarray:
+    """Largest value of so many cells a side; the last ones may be cut short."""
+    nx, ny = values.shape
+    grown = np.pad(values, ((0, -nx % times), (0, -ny % times)), mode="edge")
+    nx, ny = (n // times for n in grown.shape)
+    largest: np.ndarray = grown.reshape(nx, times, ny, times).max(axis=(1, 3))
+    return largest
