@@ -15,7 +15,7 @@ from wlplan.io import ScannedPile, read_scan
 SIDES = (24.0, 20.0)
 SLOPE = math.tan(math.radians(32.0))
 # Of both [m].
-CONE, MOUND = ((9.0, 11.0), 3.5), ((20.0, 4.0), 0.9)
+CONE, MOUND = ((9.0, 11.0), 3.5), ((20.0, 4.0), 0.7)
 
 
 def yard(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -13,11 +13,14 @@ from wlplan.checks import check_pile
 from wlplan.errors import InputError
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.terrain.outlines import distances_along, largest_outline
+from wlplan.terrain.standing import standing
 from wlplan.types import Pile, Pose
 
 TOE_RISE = 0.15
 """Rise over the ground that counts as the toe [m]."""
 
+# Steps in which the way to a point of the toe is looked at [m].
+_LANE_STEP = 0.25
 # Spacing of the points of a toe contour [m].
 _CONTOUR_SPACING = 0.1
 
@@ -40,8 +43,9 @@ def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA
     part of it. Where the pile runs over the edge of the map, the longest part inside is kept.
 
     A heading is the inward normal of the chord over one bucket width. A point is accessible if the
-    cutting edge of a bucket there lies inside the map, the scan saw its cell, and the surface a
-    bucket length ahead is still higher than `rise` above the ground.
+    cutting edge of a bucket there lies inside the map, the scan saw its cell, the surface a bucket
+    length ahead is still higher than `rise` above the ground, and nothing stands in the way of a
+    loader that comes straight on, over its length and as wide as the bucket.
 
     Args:
         pile: One pile, not a batch.
@@ -95,8 +99,33 @@ def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA
     if pile.valid is not None:
         seen = np.asarray(pile.valid, np.float64)
         accessible &= _sample(seen, points, origin, cell) > 1.0 - 1e-6
+    stands = standing(np.asarray(pile.floor), cell)
+    if stands.any():
+        # From where the rear of the loader is when it stops behind the dig location.
+        rear = machine.approach_distance + 0.5 * machine.length
+        ahead = np.arange(-rear, 0.5 * machine.bucket_depth, _LANE_STEP)
+        across = machine.bucket_width * (np.arange(0.0, 1.01, 0.125) - 0.5)
+        lane = points + normal * (ahead[:, None, None] + 1j * across[:, None])
+        accessible &= ~_any_near(stands, lane, origin, cell).any(axis=(0, 1))
     pairs = np.stack([points.real, points.imag], axis=-1)
     return ToeContour(pairs, np.angle(normal), length, closed, accessible)
+
+
+def _any_near(
+    flags: Bool[np.ndarray, "nx ny"],
+    points: Complex[np.ndarray, "*n"],
+    origin: Float[np.ndarray, "2"],
+    cell: float,
+) -> Bool[np.ndarray, "*n"]:
+    """The flags of the cells at points; none outside the map."""
+    i, j = (
+        np.rint((v - origin[k]) / cell).astype(int)
+        for k, v in enumerate((points.real, points.imag))
+    )
+    inside = (i >= 0) & (j >= 0) & (i < flags.shape[0]) & (j < flags.shape[1])
+    i, j = np.where(inside, i, 0), np.where(inside, j, 0)
+    found: np.ndarray = inside & flags[i, j]
+    return found
 
 
 def check_accessible(accessible: Bool[np.ndarray, " n"]) -> None:
