@@ -7,6 +7,7 @@ from .io.piles import read_pile as read_pile
 from .io.piles import write_pile as write_pile
 from .io.plans import read_plan as read_plan
 from .io.plans import write_plan as write_plan
+from .io.summary import info as info
 from .planning import planners as planners
 from .planning.job import Job as Job
 from .planning.job import PlanResult as PlanResult

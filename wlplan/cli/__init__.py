@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import click
 
-from wlplan.cli import benchmark, gradients, learning, maps, planning
+from wlplan.cli import benchmark, gradients, info, learning, maps, planning
 from wlplan.errors import InputError
 
 
@@ -51,7 +51,7 @@ def wlplan(context: click.Context) -> None:
 
 # In the order in which people use them, which is that of the help.
 for _command in (
-    *(planning.plan, planning.simulate, maps.diggability, learning.collect),
+    *(info.info, planning.plan, planning.simulate, maps.diggability, learning.collect),
     *(learning.train, learning.evaluate, gradients.gradcheck, benchmark.bench),
 ):
     wlplan.add_command(_command)

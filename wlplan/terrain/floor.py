@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 from scipy import ndimage, sparse
 from scipy.sparse import linalg
 
@@ -37,9 +38,7 @@ _NARROWEST = 1.0
 _DIRECT = 40_000
 
 
-def fill_unseen(
-    height: Float[Array | np.ndarray, "nx ny"], valid: Bool[Array | np.ndarray, "nx ny"]
-) -> Float[np.ndarray, "nx ny"]:
+def fill_unseen(height: ArrayLike, valid: ArrayLike) -> Float[np.ndarray, "nx ny"]:
     """Fill the cells that a scan did not see smoothly from the seen ones around them.
 
     Args:
@@ -59,9 +58,9 @@ def fill_unseen(
 
 
 def estimate_ground(
-    height: Float[Array | np.ndarray, "nx ny"],
+    height: ArrayLike,
     cell_size: float,
-    valid: Bool[Array | np.ndarray, "nx ny"] | None = None,
+    valid: ArrayLike | None = None,
     standing: Bool[np.ndarray, "nx ny"] | None = None,
 ) -> Float[np.ndarray, "nx ny"]:
     """Estimate the floor under a scanned pile from the ground around its toe.
