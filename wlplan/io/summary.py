@@ -179,10 +179,12 @@ def _deviation(
         basis = np.stack([np.ones(i.size), i * cell, j * cell], axis=-1)
         plane = np.linalg.lstsq(basis, height[i, j], rcond=None)[0]
         off = np.full(height.shape, np.nan)
-        off[i, j] = height[i, j] - basis @ plane
+        i, j = np.nonzero(bare)
+        off[i, j] = height[i, j] - np.stack([np.ones(i.size), i * cell, j * cell], axis=-1) @ plane
         ring_area = float(ring_cells.sum()) * cell**2
         alike = min(_alike(off, cell), ring_area)
-        floor = float(np.nanstd(off)) * math.sqrt(alike / ring_area) * area
+        scatter = float(np.std(off[ring_cells]))
+        floor = scatter * math.sqrt(alike / ring_area) * area
     unseen = 0.0
     holes, count = ndimage.label(~seen & ndimage.binary_dilation(pile, iterations=2))
     for number in range(1, count + 1):
@@ -223,8 +225,11 @@ def _alike(values: Float[np.ndarray, "nx ny"], cell: float) -> float:
     for side in _BLOCKS:
         nx, ny = (n // side for n in values.shape)
         blocks = values[: nx * side, : ny * side].reshape(nx, side, ny, side)
-        means = blocks.mean(axis=(1, 3))
-        means = means[np.isfinite(means)]
+        finite = np.isfinite(blocks)
+        number = finite.sum(axis=(1, 3))
+        sums = np.where(finite, blocks, 0.0).sum(axis=(1, 3))
+        full = number > 0.5 * side**2
+        means = sums[full] / number[full]
         if len(means) >= _FEWEST:
             largest = max(largest, float(np.var(means)) / spread * (side * cell) ** 2)
     return largest
