@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from wlplan.types import Pile, World
 
 
+# Widest cells, in parts of the bucket, that need no note.
+_FINE = 0.2
+
+
 @dataclasses.dataclass(frozen=True)
 class NamedSite:
     """What is dug and what digs, each with the name that it goes by."""
@@ -67,9 +71,16 @@ class NamedSite:
                 math.radians(truck[2]) if len(truck) == 3 else None,
                 machine=self.machine,
                 contour=named.contour,
+                closed=named.closed,
                 frame=named.frame,
             )
-        site = Site(machine=self.machine, soil=self.soil, receiver=receiver, frame=named.frame)
+        site = Site(
+            machine=self.machine,
+            soil=self.soil,
+            receiver=receiver,
+            keep_out=named.closed,
+            frame=named.frame,
+        )
         return beside(site, named.pile, named.contour)
 
 
@@ -81,12 +92,14 @@ class NamedPile:
         pile: In its local frame.
         contour: Its toe.
         frame: How the local frame lies to the coordinates of the scan.
+        closed: Cells that nothing may drive on; None if there are none.
         fields: What plan.json says about the pile.
     """
 
     pile: Pile
     contour: ToeContour
     frame: Frame
+    closed: Any
     fields: dict[str, Any]
 
     def local(self, x: float, y: float) -> tuple[float, float]:
@@ -177,7 +190,7 @@ def pile_named(file: PileFile, machine: WheelLoader) -> NamedPile:
 
     name, path = file.name, _path_of(file)
     scan = read_scan(path, **file.reading)
-    for note in scan.notes:
+    for note in (*scan.notes, *_coarse(scan.scanned_cell, machine, name)):
         remark(note)
     pile = scan.pile
     contour = toe_contour(pile, machine=machine)
@@ -190,7 +203,24 @@ def pile_named(file: PileFile, machine: WheelLoader) -> NamedPile:
         "notes": list(scan.notes),
         **file.reading,
     }
-    return NamedPile(pile, contour, scan.frame, fields)
+    return NamedPile(pile, contour, scan.frame, scan.contents.closed, fields)
+
+
+def _coarse(cell: float, machine: WheelLoader, name: str) -> tuple[str, ...]:
+    """A note on cells that a bucket is few of.
+
+    Raises:
+        InputError: If a cell is wider than the bucket.
+    """
+    width = machine.bucket_width
+    if cell > width:
+        raise InputError(
+            f"{name}: has cells of {cell:g} m, wider than the bucket, {width:g} m: no load can be "
+            f"told from it; scan it finer."
+        )
+    if cell <= _FINE * width:
+        return ()
+    return (f"the cells are {cell:g} m wide, the bucket {width:g} m: the loads are rough guesses",)
 
 
 def read_as_recorded(file: PileFile, record: object) -> PileFile:

@@ -163,6 +163,8 @@ def plan(
                 predicted=planned.rollout.performance,
                 settings={f"{name}, wall clock": text for name, text in seconds.items()},
             )
+    for note in document["notes"]:
+        remark(note)
     remark_on_ledger(document["ledger"])
     for name, numbers in violations_of(planned, goal.constraints).items():
         remark(f"{name} is violated by load {', '.join(map(str, numbers))}")
@@ -295,6 +297,8 @@ def simulate(
                 predicted=predicted,
                 settings={f"{engine}, wall clock": playing.text()},
             )
+    for note in document["notes"]:
+        remark(note)
     remark_on_ledger(document["ledger"])
     if as_json:
         click.echo(text)

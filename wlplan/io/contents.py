@@ -30,7 +30,7 @@ class Contents:
 
     Attributes:
         height: Surface, with obstacles as high as they were drawn [m].
-        floor: Under all that stands and lies on it [m].
+        floor: Under all that stands and lies on it, also where the surface lies lower [m].
         ground: What cannot be moved: floor, structures, and other piles than the one asked for [m].
         structures: What stands in it, largest first.
         piles: All piles, largest first.
@@ -99,7 +99,7 @@ def contents_of(
         estimated = estimate_ground(height, cell_size, valid, standing)
         known = np.zeros(height.shape, bool) if known_ground is None else known_ground
         ground = estimated if ground is None else np.where(known, ground, estimated)
-    floor = ground = np.minimum(ground, height)
+    floor, ground = ground, np.minimum(ground, height)
     for area, mask in zip(areas, masks, strict=True):
         if area.kind == "obstacle" and area.height is not None:
             height = np.where(mask, np.maximum(height, ground + area.height), height)

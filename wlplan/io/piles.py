@@ -36,12 +36,14 @@ class ScannedPile:
         frame: How that lies to the coordinates of the file, and their reference system.
         notes: What was assumed, converted or left out, in words: sentences without their stops.
         contents: Structures, piles and areas; the ground of the pile holds all that is not dug.
+        scanned_cell: Side of the cells before they were put on the grid of the models [m].
     """
 
     pile: Pile
     frame: Frame
     notes: tuple[str, ...]
     contents: Contents
+    scanned_cell: float
 
 
 def read_pile(
@@ -120,7 +122,7 @@ def read_scan(
         ground=None if grid.ground is None else jnp.asarray(grid.ground),
         valid=None if grid.valid is None else jnp.asarray(grid.valid),
     )
-    return ScannedPile(pile, survey.frame, survey.notes, survey.contents)
+    return ScannedPile(pile, survey.frame, survey.notes, survey.contents, survey.scanned_cell)
 
 
 def write_pile(path: str | os.PathLike[str], pile: Pile) -> None:

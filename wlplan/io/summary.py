@@ -1,16 +1,8 @@
 """What a scan holds, in numbers: volumes with their uncertainty, piles, slopes, structures.
 
-The deviation of a volume (one standard deviation) has three parts that are taken as independent:
-
-* noise of the cells: how much second differences of the surface scatter on the pile, which a smooth
-  surface does not, times the root of its area and of the area over which noise is alike;
-* the floor under the pile, which nobody saw: how much the ground around it scatters about a plane,
-  averaged over the ring that the floor is interpolated from, times the area of the pile;
-* cells that the scan did not see: half of what lies above the lowest seen cell at their border.
-
-Areas over which values are alike come from the scatter of block means, as block kriging and xdem's
-patches do it: the scatter of means over blocks falls with the root of their number, of independent
-ones. What is wrong with a whole scan (a scale, a wrong floor) is in none of them.
+A volume is taken over the footprint of a pile with a skirt around it, against the floor: where the
+surface lies below that it counts less than nothing, so that noise makes no volume. How well it is
+known: `wlplan.terrain.volume`. What is wrong with a whole scan, a scale for instance, is not in it.
 """
 
 from __future__ import annotations
@@ -27,20 +19,17 @@ from wlplan.constants import KG_PER_TONNE
 from wlplan.io.contents import Contents
 from wlplan.io.survey import Survey, read_survey
 from wlplan.site.soil import GRAVEL, Soil
-from wlplan.terrain.grid import Grid
 from wlplan.terrain.parts import Part, find_parts
+from wlplan.terrain.volume import noise_intensity, volume_deviation
 
 # Rise over the ground that counts as pile [m], as for the toe.
 _RISE = 0.15
-# Width of the ring of ground around a pile that its floor rests on [m].
-_RING = 2.0
-# Sides of the blocks whose means are compared [cells], and fewest blocks that say anything.
-_BLOCKS, _FEWEST = (2, 4, 8, 16, 32), 12
+# Width of the skirt around what is higher than that [m].
+_SKIRT = 0.5
 # Ground that is so much higher than the floor is something that stands [m].
 _STANDING = 0.1
 # Distance over which slopes are taken [m]: longer than the noise of a cell.
 _SLOPE_OVER = 1.0
-_NORMAL_MAD = 1.4826
 
 
 def info(
@@ -64,15 +53,28 @@ def info(
     grid, frame, contents = survey.grid, survey.frame, survey.contents
     height = grid.height.astype(np.float64)
     ground = height * 0.0 if grid.ground is None else grid.ground.astype(np.float64)
-    above = height - ground
+    above, over = height - ground, height - contents.floor
     labels, parts = find_parts(above, grid.cell_size, grid.origin.astype(float), rise=_RISE)
     seen = np.ones(above.shape, bool) if grid.valid is None else grid.valid
     stands = ground - contents.floor > _STANDING
-    bare = seen & ~stands & (above < _RISE)
+    footprints = [_footprint(labels, part.number, stands, grid.cell_size) for part in parts]
+    volumes = [float(over[cells].sum()) * grid.cell_size**2 for cells in footprints]
+    soil_cells = np.any([*footprints, np.zeros(above.shape, bool)], axis=0)
+    intensity = noise_intensity(
+        height, seen & ~stands, soil_cells, grid.cell_size, survey.scanned_cell
+    )
     deviations = [
-        _deviation(labels == part.number, bare, above, height, seen, grid) for part in parts
+        volume_deviation(
+            height,
+            contents.floor,
+            seen & ~stands,
+            cells,
+            soil_cells,
+            cell=grid.cell_size,
+            intensity=intensity,
+        )
+        for cells in footprints
     ]
-    total = _combined(deviations)
     from scipy import ndimage
 
     free = (above > _RISE) & ~ndimage.binary_dilation(stands, iterations=_reach(grid.cell_size))
@@ -82,16 +84,22 @@ def info(
     first = grid.origin.astype(float)
     last = first + grid.cell_size * (np.array(grid.height.shape) - 1.0)
     low, high = (frame.scan(float(x), float(y)) for x, y in (first, last))
-    volume = float(above.sum()) * grid.cell_size**2
+    # The floors of all piles may be wrong the same way.
+    parts_of = {
+        "noise": math.hypot(*(one.noise for one in deviations)),
+        "unseen": math.hypot(*(one.unseen for one in deviations)),
+        "floor": sum(one.floor for one in deviations),
+    }
+    volume = sum(volumes)
     notes = [*survey.notes, *_steep(steepest, soil)]
     return {
         "volume": volume,
-        "volume_deviation": total["all"],
-        "volume_deviation_parts": {name: total[name] for name in ("noise", "floor", "unseen")},
+        "volume_deviation": math.hypot(*parts_of.values()),
+        "volume_deviation_parts": parts_of,
         "tonnes": volume * soil.density / KG_PER_TONNE,
         "piles": [
-            _pile(part, deviation["all"], contents, survey, labels, soil)
-            for part, deviation in zip(parts, deviations, strict=True)
+            _pile(part, bulk, deviation.total, contents, survey, labels, soil)
+            for part, bulk, deviation in zip(parts, volumes, deviations, strict=True)
         ],
         "structures": [
             {
@@ -117,17 +125,35 @@ def info(
     }
 
 
+def _footprint(
+    labels: np.ndarray, number: int, stands: Bool[np.ndarray, "nx ny"], cell: float
+) -> Bool[np.ndarray, "nx ny"]:
+    """Cells of a pile with the skirt around it that belongs to no other one."""
+    from scipy import ndimage
+
+    own = labels == number
+    near = ndimage.distance_transform_edt(~own) * cell <= _SKIRT
+    footprint: np.ndarray = near & ~stands & (own | (labels == 0))
+    return footprint
+
+
 def _pile(
-    part: Part, deviation: float, contents: Contents, survey: Survey, labels: np.ndarray, soil: Soil
+    part: Part,
+    volume: float,
+    deviation: float,
+    contents: Contents,
+    survey: Survey,
+    labels: np.ndarray,
+    soil: Soil,
 ) -> dict[str, Any]:
     x, y = survey.frame.scan(part.x, part.y)
     planned = contents.planned
     return {
         "x": x,
         "y": y,
-        "volume": part.volume,
+        "volume": volume,
         "volume_deviation": deviation,
-        "tonnes": part.volume * soil.density / KG_PER_TONNE,
+        "tonnes": volume * soil.density / KG_PER_TONNE,
         "height": part.height,
         "area": part.area,
         "toe_length": _outline_length(labels == part.number) * survey.grid.cell_size,
@@ -151,96 +177,6 @@ def _steep(steepest: float, soil: Soil) -> list[str]:
         f"the pile stands at up to {steepest:.0f} degrees, the soil rests at {repose:.0f}: such "
         f"faces slide when they are dug, or choose a --soil that stands as steep"
     ]
-
-
-def _deviation(
-    pile: Bool[np.ndarray, "nx ny"],
-    bare: Bool[np.ndarray, "nx ny"],
-    above: Float[np.ndarray, "nx ny"],
-    height: Float[np.ndarray, "nx ny"],
-    seen: Bool[np.ndarray, "nx ny"],
-    grid: Grid,
-) -> dict[str, float]:
-    """Standard deviation of the volume of a pile, and its parts [m^3]; see the module."""
-    from scipy import ndimage
-
-    cell = grid.cell_size
-    area = float(pile.sum()) * cell**2
-    # Noise: what is left of the surface when its smooth part is taken off.
-    rough = height - ndimage.gaussian_filter(height, 0.5 / cell)
-    inner = ndimage.binary_erosion(pile & seen, iterations=3)
-    sigma = _scatter(height, inner)
-    noise = sigma * math.sqrt(_alike(np.where(inner, rough, np.nan), cell) * area)
-    ring = ndimage.distance_transform_edt(~pile) * cell
-    ring_cells = (ring > 0.5) & (ring <= 0.5 + _RING) & bare
-    floor = 0.0
-    if ring_cells.sum() > 3 * _FEWEST:
-        i, j = np.nonzero(ring_cells)
-        basis = np.stack([np.ones(i.size), i * cell, j * cell], axis=-1)
-        plane = np.linalg.lstsq(basis, height[i, j], rcond=None)[0]
-        off = np.full(height.shape, np.nan)
-        i, j = np.nonzero(bare)
-        off[i, j] = height[i, j] - np.stack([np.ones(i.size), i * cell, j * cell], axis=-1) @ plane
-        ring_area = float(ring_cells.sum()) * cell**2
-        alike = min(_alike(off, cell), ring_area)
-        scatter = float(np.std(off[ring_cells]))
-        floor = scatter * math.sqrt(alike / ring_area) * area
-    unseen = 0.0
-    holes, count = ndimage.label(~seen & ndimage.binary_dilation(pile, iterations=2))
-    for number in range(1, count + 1):
-        hole = holes == number
-        border = ndimage.binary_dilation(hole) & seen
-        lowest = above[border].min() if border.any() else 0.0
-        unseen += 0.5 * float(np.maximum(above[hole] - lowest, 0.0).sum()) * cell**2
-    parts = {"noise": noise, "floor": floor, "unseen": unseen}
-    return {**parts, "all": math.sqrt(sum(value**2 for value in parts.values()))}
-
-
-def _scatter(height: Float[np.ndarray, "nx ny"], cells: Bool[np.ndarray, "nx ny"]) -> float:
-    """Standard deviation of the noise of cells [m], from second differences over three cells."""
-    step = 3
-    found = []
-    for axis in (0, 1):
-        second = np.roll(height, step, axis) - 2.0 * height + np.roll(height, -step, axis)
-        whole = cells & np.roll(cells, step, axis) & np.roll(cells, -step, axis)
-        values = second[whole]
-        if values.size >= _FEWEST:
-            # A slope of constant curvature adds a constant.
-            spread = _NORMAL_MAD * float(np.median(np.abs(values - np.median(values))))
-            found.append(spread / math.sqrt(6.0))
-    return min(found, default=0.0)
-
-
-def _alike(values: Float[np.ndarray, "nx ny"], cell: float) -> float:
-    """Area over which values are alike [m^2]: of a block whose mean scatters as one value does.
-
-    Args:
-        values: NaN where there is none.
-        cell: Grid spacing [m].
-    """
-    spread = float(np.nanvar(values)) if np.isfinite(values).any() else 0.0
-    largest = cell**2
-    if spread == 0.0:
-        return largest
-    for side in _BLOCKS:
-        nx, ny = (n // side for n in values.shape)
-        blocks = values[: nx * side, : ny * side].reshape(nx, side, ny, side)
-        finite = np.isfinite(blocks)
-        number = finite.sum(axis=(1, 3))
-        sums = np.where(finite, blocks, 0.0).sum(axis=(1, 3))
-        full = number > 0.5 * side**2
-        means = sums[full] / number[full]
-        if len(means) >= _FEWEST:
-            largest = max(largest, float(np.var(means)) / spread * (side * cell) ** 2)
-    return largest
-
-
-def _combined(deviations: list[dict[str, float]]) -> dict[str, float]:
-    """Deviations of all piles together; their floors are taken as wrong the same way."""
-    noise = math.sqrt(sum(one["noise"] ** 2 for one in deviations))
-    floor, unseen = (sum(one[name] for one in deviations) for name in ("floor", "unseen"))
-    everything = math.sqrt(noise**2 + floor**2 + unseen**2)
-    return {"noise": noise, "floor": floor, "unseen": unseen, "all": everything}
 
 
 def _reach(cell: float) -> int:

@@ -59,12 +59,14 @@ class Survey:
         frame: How that lies to the coordinates of the file, and their reference system.
         notes: What was assumed, converted or left out, in words: sentences without their stops.
         contents: Structures, piles and areas; the ground of the pile holds all that is not dug.
+        scanned_cell: Side of the cells before they were put on that grid [m].
     """
 
     grid: Grid
     frame: Frame
     notes: tuple[str, ...]
     contents: Contents
+    scanned_cell: float
 
 
 def read_survey(
@@ -273,7 +275,7 @@ def _surveyed(
         cell_size=CELL_SIZE,
     )
     notes = (*scan.notes, *notes, *_sloping(contents.floor, CELL_SIZE), *contents.notes)
-    return Survey(grid, frame, notes, contents)
+    return Survey(grid, frame, notes, contents, float(scan.cell_size))
 
 
 def _overview(

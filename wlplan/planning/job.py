@@ -77,10 +77,11 @@ def make_job(
     return Job(
         world=as_pytree(world),
         pile=pile,
-        # Nothing that is computed depends on the frame: what is compiled serves all of them.
-        site=placed.replace(frame=LOCAL),
+        # Nothing that is computed depends on the frame: what is compiled serves all of them. What
+        # is closed to traffic is part of the yard.
+        site=placed.replace(frame=LOCAL, keep_out=None),
         objective=objective_of(objective),
-        yard=yard_of(pile, placed.machine),
+        yard=yard_of(pile, placed.machine, placed.keep_out),
     )
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from wlplan.errors import InputError
 from wlplan.planning.way import Room, lane_touching, room_of, way_to
@@ -43,6 +44,10 @@ _TOUCHING, _TRUCK_ON, _TRUCK_UNSEEN = 20.0, 40.0, 2.0
 _BATCH = 32
 
 
+Closed: TypeAlias = Bool[ArrayLike, "nx ny"] | None
+"""Cells of a grid that nothing may drive on; None if there are none."""
+
+
 def beside(site: Site, pile: Pile, contour: ToeContour | None = None) -> Site:
     """The site with a receiver: its own, or one beside a pile.
 
@@ -59,7 +64,8 @@ def beside(site: Site, pile: Pile, contour: ToeContour | None = None) -> Site:
     check_machine(site.machine)
     if site.receiver is not None:
         return site
-    return site.replace(receiver=best_receiver(pile, machine=site.machine, contour=contour))
+    receiver = best_receiver(pile, machine=site.machine, contour=contour, closed=site.keep_out)
+    return site.replace(receiver=receiver)
 
 
 def place_receiver(
@@ -69,6 +75,7 @@ def place_receiver(
     *,
     machine: WheelLoader = WA320,
     contour: ToeContour | None = None,
+    closed: Closed = None,
     frame: Frame = LOCAL,
 ) -> Receiver:
     """A receiver at a place.
@@ -79,6 +86,7 @@ def place_receiver(
         heading: Of the loader as it dumps [rad]; None: the one with the shortest ways.
         machine: What drives there.
         contour: Toe of the pile where it is known already.
+        closed: Cells of its grid that nothing may drive on.
         frame: What complaints give places in.
 
     Raises:
@@ -105,12 +113,16 @@ def place_receiver(
     if heading is None:
         degrees = np.arange(-180.0, 180.0, _HEADING_STEP)
         places = np.array([[x, y, math.radians(d)] for d in degrees])
-        heading = float(_best(places, pile, machine, contour)[2])
+        heading = float(_best(places, pile, machine, contour, closed)[2])
     return Receiver(*point, jnp.asarray(math.remainder(heading, 2.0 * math.pi), dtype))
 
 
 def best_receiver(
-    pile: Pile, *, machine: WheelLoader = WA320, contour: ToeContour | None = None
+    pile: Pile,
+    *,
+    machine: WheelLoader = WA320,
+    contour: ToeContour | None = None,
+    closed: Closed = None,
 ) -> Receiver:
     """The receiver beside a pile from where the ways to the toe nearby are shortest.
 
@@ -120,6 +132,7 @@ def best_receiver(
         pile: The pile.
         machine: What drives there.
         contour: Toe of the pile where it is known already.
+        closed: Cells of its grid that nothing may drive on.
 
     Raises:
         InputError: If a bucket can start nowhere on the toe.
@@ -139,7 +152,7 @@ def best_receiver(
         axis=-1,
     ).reshape(-1, 3)
     dtype = pile.height.dtype
-    px, py, heading = _best(places, pile, machine, contour)
+    px, py, heading = _best(places, pile, machine, contour, closed)
     heading = math.remainder(heading, 2.0 * math.pi)
     return Receiver(*(jnp.asarray(v, dtype) for v in (px, py, heading)))
 
@@ -149,6 +162,7 @@ def _best(
     pile: Pile,
     machine: WheelLoader,
     contour: ToeContour | None,
+    closed: Closed,
 ) -> Float[np.ndarray, "3"]:
     """The place x [m], y [m], heading [rad] with the shortest ways and room for the truck."""
     contour = toe_contour(pile, machine=machine) if contour is None else contour
@@ -156,7 +170,7 @@ def _best(
     poses = np.stack([np.asarray(v, float) for v in (digs.x, digs.y, digs.heading)], axis=-1)
     apart = np.hypot(*(places[:, None, :2] - poses[None, :, :2]).transpose(2, 0, 1))
     nearest = poses[np.argsort(apart, axis=1)[:, :_NEAREST]]
-    room = room_of(yard_of(pile, machine), pile)
+    room = room_of(yard_of(pile, machine, closed), pile)
     # Always as many at once, whatever the pile: they are compiled for once.
     rows = np.minimum(np.arange(-(-len(places) // _BATCH) * _BATCH), len(places) - 1)
     dtype = pile.height.dtype

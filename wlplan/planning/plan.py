@@ -79,7 +79,9 @@ def plan_loads(
     proposals = chosen.propose(job, loads, seed=seed, progress=progress)
     if referee is None:
         return choose(job, proposals)
-    return choose(job, proposals, referee=make_job(referee, pile, site=job.site).world)
+    return choose(
+        job, proposals, referee=make_job(referee, pile, site=job.site, contour=contour).world
+    )
 
 
 def planner_of(planner: str | Planner, world: World) -> Planner:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, ArrayLike, Bool, Float, UInt8
 
 from wlplan.site.machine import WheelLoader
 from wlplan.terrain.standing import CLEARED, pooled, standing
@@ -46,7 +46,7 @@ def disc_radius(machine: WheelLoader) -> float:
 
 
 def yard_of(
-    pile: Pile, machine: WheelLoader, closed: Bool[np.ndarray, "nx ny"] | None = None
+    pile: Pile, machine: WheelLoader, closed: Bool[ArrayLike, "nx ny"] | None = None
 ) -> Yard:
     """The yard around a pile.
 
@@ -60,7 +60,7 @@ def yard_of(
     border = _border(reach, cell)
     stands = standing(np.asarray(pile.floor), pile.cell_size)
     if closed is not None:
-        stands = stands | closed
+        stands = stands | np.asarray(closed)
     unseen = np.zeros_like(stands) if pile.valid is None else ~np.asarray(pile.valid)
     middle = 0.5 * (_COARSE - 1) * pile.cell_size
     origin = np.asarray(pile.origin, np.float64) + middle - border * cell

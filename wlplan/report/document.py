@@ -17,6 +17,7 @@ from wlplan.planning.clearance import clearance
 from wlplan.planning.job import PlanResult
 from wlplan.planning.way import points_of
 from wlplan.planning.yard import unpacked_soil
+from wlplan.report.plausibility import remarks_on
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
 from wlplan.site.soil import Soil
@@ -60,8 +61,10 @@ def plan_document(
     }
     if predicted is not None:
         total = {"predicted": totals(predicted, predicted_cost), **total}
-    ways = {} if simulated.ways is None else {"paths": paths_of(before, simulated, site)}
-    return plan_to_dict(
+    ways: dict[str, Any] = (
+        {} if simulated.ways is None else {"paths": paths_of(before, simulated, site)}
+    )
+    document = plan_to_dict(
         simulated.plan,
         **ways,
         predicted=predicted,
@@ -73,6 +76,7 @@ def plan_document(
         total=total,
         ledger=ledger_of(before, simulated, site.soil),
     )
+    return {**document, "notes": remarks_on(document, before, site)}
 
 
 def paths_of(before: Pile, played: PlanResult, site: Site) -> list[dict[str, Any]]:
@@ -86,7 +90,8 @@ def paths_of(before: Pile, played: PlanResult, site: Site) -> list[dict[str, Any
     assert played.ways is not None
     machine, receiver = site.machine, receiver_fields(site.placed_receiver)
     to = np.array([receiver[name] for name in RECEIVER_FIELDS])
-    stands, found = standing(np.asarray(before.floor), before.cell_size), []
+    closed = False if site.keep_out is None else np.asarray(site.keep_out)
+    stands, found = closed | standing(np.asarray(before.floor), before.cell_size), []
     ways = jax.tree.map(lambda leaf: np.asarray(leaf), played.ways)
     pose = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(played.plan.pose)]
     for n in range(len(pose[0])):

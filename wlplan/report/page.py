@@ -93,6 +93,7 @@ def _template() -> Template:
         keep_trailing_newline=True,
     )
     environment.filters |= {
+        "capitalise": lambda text: str(text)[:1].upper() + str(text)[1:],
         "coordinate": _coordinate,
         "degrees": _degrees,
         "difference": _difference,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import no_type_check
 
 from flax import struct
+from jaxtyping import Array, Bool
 
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
@@ -19,6 +20,7 @@ class Site(struct.PyTreeNode):
     machine: WheelLoader = struct.field(pytree_node=False, default=WA320)
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     receiver: Receiver | None = None  # None: a place beside whatever pile there is
+    keep_out: Bool[Array, "nx ny"] | None = None  # cells of the pile's grid closed to traffic
     frame: Frame = struct.field(pytree_node=False, default=LOCAL)  # that everything here is in
 
     @property

@@ -1,0 +1,295 @@
+"""What is not soil: found where it stands, left standing, and no way through it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from laws import volume
+
+from wlplan.errors import InputError
+from wlplan.io import read_scan
+from wlplan.site.frame import LOCAL
+from wlplan.terrain.automaton import relax
+from wlplan.terrain.excavation import excavate
+from wlplan.terrain.heightmap import add_local_change
+from wlplan.terrain.standing import lower_envelope, standing
+from wlplan.terrain.structures import find_structures
+from wlplan.terrain.toe import toe_contour
+from wlplan.types import Pile, Pose
+
+CELL = 0.1
+SLOPE = np.tan(np.radians(32.0))
+
+
+def plane(x1: float = 30.0, y1: float = 24.0, cell: float = CELL) -> tuple[np.ndarray, np.ndarray]:
+    x, y = np.meshgrid(
+        np.arange(0.5 * cell, x1, cell), np.arange(0.5 * cell, y1, cell), indexing="ij"
+    )
+    return x, y
+
+
+def cone(x: np.ndarray, y: np.ndarray, at: tuple[float, float] = (18.0, 10.0)) -> np.ndarray:
+    height: np.ndarray = np.maximum(0.0, 3.5 - np.hypot(x - at[0], y - at[1]) * SLOPE)
+    return height
+
+
+def turned(
+    x: np.ndarray, y: np.ndarray, at: tuple[float, float], angle: float, sides: tuple[float, float]
+) -> np.ndarray:
+    """Cells of a rectangle."""
+    u = (x - at[0]) * np.cos(angle) + (y - at[1]) * np.sin(angle)
+    v = (y - at[1]) * np.cos(angle) - (x - at[0]) * np.sin(angle)
+    inside: np.ndarray = (np.abs(u) <= 0.5 * sides[0]) & (np.abs(v) <= 0.5 * sides[1])
+    return inside
+
+
+def save(path: Path, height: np.ndarray, cell: float = CELL, **more: Any) -> Path:
+    np.savez(path, height=height, cell_size=cell, **more)
+    return path
+
+
+def rough(height: np.ndarray, scatter: float = 0.02, seed: int = 3) -> np.ndarray:
+    noisy: np.ndarray = height + np.random.default_rng(seed).normal(0.0, scatter, height.shape)
+    return noisy
+
+
+# --- finding
+
+
+@pytest.mark.parametrize("cell", [0.1, 0.2])
+def test_walls_boxes_and_buildings_are_found_at_any_angle(cell: float) -> None:
+    """Random things beside a pile: each is found, and the pile keeps its volume."""
+    random = np.random.default_rng(1)
+    x, y = plane(cell=cell)
+    pile = cone(x, y)
+    for number in range(12):
+        kind = number % 4
+        sides = ((8.0, 0.4), (6.0, 2.4), (2.0, 1.6), (7.0, 5.0))[kind]
+        tall = (2.5, 2.6, 1.8, 4.0)[kind]
+        at = (random.uniform(4.0, 8.0), random.uniform(5.0, 19.0))
+        cells = turned(x, y, at, random.uniform(0.0, np.pi), sides)
+        height = rough(np.where(cells, tall, pile), seed=number)
+        labels, found = find_structures(height, cell, np.array([0.5 * cell] * 2))
+        assert len(found) == 1, (number, found)
+        assert np.hypot(found[0].x - at[0], found[0].y - at[1]) < 0.5
+        assert found[0].length == pytest.approx(sides[0], abs=0.5 + 2 * cell)
+        assert found[0].height == pytest.approx(tall, abs=0.15)
+        # All of it, and next to nothing else.
+        assert (labels[cells] > 0).mean() > 0.97
+        outside = (labels > 0) & ~cells
+        assert outside.sum() * cell**2 < 2.5 * cell * 2.0 * sum(sides)
+
+
+def test_piles_are_no_structures() -> None:
+    """Noise, fresh faces of 50 degrees, ridges, single spikes."""
+    x, y = plane()
+    steep = np.clip((9.0 - np.abs(x - 15.0)) * np.tan(np.radians(50.0)), 0.0, 3.0)
+    spiked = rough(cone(x, y), 0.03)
+    spiked[40, 40] += 3.0
+    for height in (rough(cone(x, y), 0.03), rough(steep, 0.02), spiked):
+        labels, found = find_structures(height, CELL, np.zeros(2))
+        assert not found
+        assert not labels.any()
+
+
+def test_a_pile_that_leans_on_a_building_is_soil() -> None:
+    x, y = plane()
+    height = rough(np.where(x < 10.0, 6.0, cone(x, y, (10.0, 12.0))))
+    labels, (building,) = find_structures(height, CELL, np.zeros(2))
+    assert building.kind == "block"
+    assert (labels[x < 9.9] > 0).all()
+    # But for the first decimetre, whose slope is the wall's.
+    assert not (labels[x > 10.2] > 0).any()
+
+
+def test_what_stands_over_a_sloping_floor() -> None:
+    slope = 0.15 * CELL * np.arange(200)[:, None] * np.ones((1, 160))
+    assert not standing(slope, CELL).any()
+    slope[80:90, 60:70] += 1.0
+    found = standing(slope, CELL)
+    assert found[80:90, 60:70].all()
+    assert found.sum() < 300
+
+
+def test_the_envelope_is_the_cone_below() -> None:
+    height = np.full((41, 41), 5.0)
+    height[20, 20] = 0.0
+    low = lower_envelope(height, 0.5, 40)
+    assert low[20, 28] == pytest.approx(4.0)
+    assert low[23, 23] == pytest.approx(0.5 * 3 * np.sqrt(2.0))
+    assert low[0, 0] == 5.0
+
+
+# --- a scan with them
+
+
+def bay() -> np.ndarray:
+    """Three walls 3 m high, open to the south, with soil almost as high."""
+    x, y = plane()
+    y = y + 4.0
+    inside = (x > 10.8) & (x < 19.2) & (y < 22)
+    soil = np.where(inside, np.clip(3.0 - 0.62 * np.maximum(0, 17 - y), 0, 2.8), 0.0)
+    wall = (y > 22) & (y < 22.8) & (x > 10) & (x < 20)
+    for side in (10.0, 19.2):
+        wall |= (x > side) & (x < side + 0.8) & (y > 14) & (y < 22.8)
+    return rough(np.where(wall, 3.0, soil))
+
+
+def test_a_bay_is_dug_from_its_open_side(tmp_path: Path) -> None:
+    scan = read_scan(save(tmp_path / "bay.npz", bay(), origin=np.array([500_000.05, 0.05])))
+    (wall,) = scan.contents.structures
+    assert wall.kind == "wall"
+    (note,) = [note for note in scan.notes if "left standing" in note]
+    assert "3.1 m high" in note
+    assert "50001" in note
+    x, y = plane()
+    y = y + 4.0
+    inside = (x > 10.8) & (x < 19.2) & (y < 22)
+    soil = np.where(inside, np.clip(3.0 - 0.62 * np.maximum(0, 17 - y), 0, 2.8), 0.0)
+    # The first decimetre along the walls counts as wall.
+    assert float(volume(scan.pile)) == pytest.approx(float(soil.sum()) * CELL**2, rel=0.05)
+    contour = toe_contour(scan.pile)
+    points, heading = contour.points[contour.accessible], contour.heading[contour.accessible]
+    assert len(points) > 40
+    assert (np.abs(points[:, 0] - 15.0) < 4.3).all()
+    assert (np.sin(heading) > 0.8).all()
+
+
+def test_what_was_taken_out_can_be_put_back(tmp_path: Path) -> None:
+    path = save(tmp_path / "bay.npz", bay())
+    soil = read_scan(path, include=(10.4, 15.0))
+    assert not soil.contents.structures
+    assert float(volume(soil.pile)) > float(volume(read_scan(path).pile)) + 50.0
+    with pytest.raises(InputError, match="nothing stands at 2"):
+        read_scan(path, include=(2.0, 2.0))
+
+
+def features(*polygons: tuple[list[list[float]], dict[str, Any]]) -> str:
+    return json.dumps(
+        {
+            "type": "FeatureCollection",
+            "features": [
+                {
+                    "type": "Feature",
+                    "properties": properties,
+                    "geometry": {"type": "Polygon", "coordinates": [ring]},
+                }
+                for ring, properties in polygons
+            ],
+        }
+    )
+
+
+def square(x: float, y: float, side: float) -> list[list[float]]:
+    return [[x, y], [x + side, y], [x + side, y + side], [x, y + side], [x, y]]
+
+
+def test_areas_that_people_draw(tmp_path: Path) -> None:
+    x, y = plane()
+    path = save(tmp_path / "a.npz", cone(x, y), origin=np.array([500_000.05, 0.05]))
+    drawn = tmp_path / "areas.geojson"
+    drawn.write_text(
+        features(
+            (square(500_002.0, 2.0, 3.0), {"height": 2.0}),
+            (square(500_017.0, 9.0, 2.0), {"kind": "no-dig"}),
+            (square(500_026.0, 2.0, 2.0), {"kind": "no-go"}),
+        )
+    )
+    plain, scan = read_scan(path), read_scan(path, keep_out=str(drawn))
+    height, ground = np.asarray(scan.pile.height), np.asarray(scan.pile.floor)
+    box = (x > 2.0) & (x < 5.0) & (y > 2.0) & (y < 5.0)
+    np.testing.assert_allclose(ground[box], 2.0, atol=1e-5)
+    np.testing.assert_allclose(height[box], 2.0, atol=1e-5)
+    kept = (x > 17.0) & (x < 19.0) & (y > 9.0) & (y < 11.0)
+    np.testing.assert_array_equal(ground[kept], height[kept])
+    lost = float(volume(plain.pile)) - float(volume(scan.pile))
+    assert lost == pytest.approx(float(cone(x, y)[kept].sum()) * CELL**2, rel=0.01)
+    assert scan.contents.closed is not None
+    assert scan.contents.closed.sum() == 400
+    assert [note for note in scan.notes if "no-go" in note]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{", "not GeoJSON"),
+        ("[]", "no features"),
+        ('{"type": "FeatureCollection", "features": []}', "no polygon"),
+        ('{"type": "Point", "coordinates": [1, 2]}', "no polygon"),
+        ('{"type": "Polygon", "coordinates": [[[1, 2], [3, 4]]]}', "three corners"),
+        ('{"type": "Polygon", "coordinates": [[["a", 2], [3, 4], [5, 6]]]}', "three corners"),
+        (features((square(1.0, 1.0, 2.0), {"kind": "lake"})), "of kind 'lake'"),
+        (features((square(1.0, 1.0, 2.0), {"height": -1})), "height is -1"),
+        (features((square(900.0, 1.0, 2.0), {})), "no area lies in the scan"),
+    ],
+)
+def test_areas_that_are_none_are_refused(tmp_path: Path, text: str, words: str) -> None:
+    x, y = plane()
+    path = save(tmp_path / "a.npz", cone(x, y))
+    (tmp_path / "areas.geojson").write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        read_scan(path, keep_out=str(tmp_path / "areas.geojson"))
+    assert "\n" not in str(caught.value)
+
+
+def test_the_pile_that_is_meant(tmp_path: Path) -> None:
+    x, y = plane()
+    two = np.maximum(0.8 * cone(x, y, (7.0, 12.0)), cone(x, y, (22.0, 12.0)))
+    path = save(tmp_path / "two.npz", two)
+    both, western = read_scan(path), read_scan(path, pile=(8.0, 12.0))
+    (note,) = [note for note in both.notes if "2 piles" in note]
+    assert "(planned), " in note
+    assert "--pile X,Y" in note
+    assert western.contents.planned is not None
+    assert western.contents.planned.x == pytest.approx(7.0, abs=0.1)
+    assert float(volume(western.pile)) == pytest.approx(both.contents.piles[1].volume, rel=0.02)
+    assert toe_contour(western.pile).points[:, 0].max() < 14.0
+    with pytest.raises(InputError, match="no pile at 15, 2: 2 piles in the scan"):
+        read_scan(path, pile=(15.0, 2.0))
+    assert LOCAL.local(1.0, 2.0) == (1.0, 2.0)
+
+
+# --- laws
+
+
+def walled(diagonal: bool) -> Pile:
+    """Soil much steeper than it stands on one side of a wall of one cell, nothing on the other."""
+    i, j = np.meshgrid(np.arange(120), np.arange(120), indexing="ij")
+    # A diagonal whose cells touch at their sides.
+    wall = np.abs(i + j - 120) <= 1 if diagonal else i == 60
+    left = (i + j < 119) if diagonal else (i < 60)
+    near = (119 - i - j if diagonal else 60 - i) < 20
+    height = np.where(wall, 2.5, np.where(left & near, 2.0, 0.0)).astype(np.float32)
+    ground = np.where(wall, 2.5, 0.0).astype(np.float32)
+    return Pile(height, CELL, ground=ground)
+
+
+@pytest.mark.parametrize("diagonal", [False, True])
+def test_soil_does_not_pass_a_wall(diagonal: bool) -> None:
+    before = walled(diagonal)
+    after = relax(before, repose_angle=0.6)
+    i, j = np.meshgrid(np.arange(120), np.arange(120), indexing="ij")
+    beyond = (i + j > 121) if diagonal else (i > 60)
+    above = np.asarray(after.height - after.floor, np.float64)
+    assert above[beyond].sum() == 0.0
+    assert above.sum() == pytest.approx(
+        float(np.asarray(before.height - before.floor, np.float64).sum()), rel=1e-5
+    )
+    assert (np.asarray(after.height) >= np.asarray(after.floor) - 1e-6).all()
+    assert not np.array_equal(np.asarray(after.height), np.asarray(before.height))
+
+
+def test_ground_is_not_dug() -> None:
+    """A cell whose surface is its ground never loses height."""
+    before = walled(diagonal=False)
+    pose = Pose(*(jnp.float32(v) for v in (5.0, 6.0, 0.0)))
+    bare = np.asarray(before.height) == np.asarray(before.floor)
+    dug = excavate(before, pose, jnp.float32(3.0), width=2.7).pile
+    change = jnp.full((52, 52), -0.5, jnp.float32)
+    written, _ = add_local_change(before.height, before, pose, change, 1.0)
+    for after in (dug.height, written):
+        assert (np.asarray(after)[bare] >= np.asarray(before.height)[bare] - 1e-6).all()
+        assert float(jnp.abs(after - before.height).max()) > 0.1

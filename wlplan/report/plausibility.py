@@ -1,0 +1,118 @@
+"""What a foreman should know of a plan before a machine is sent: one sentence each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from wlplan.planning.placement import truck_stands_on
+from wlplan.site.frame import Frame
+from wlplan.site.site import Site
+from wlplan.terrain.standing import CLEARED, standing
+from wlplan.types import Pile
+
+# Part of the median load below which a load yields next to nothing.
+_NEXT_TO_NOTHING = 0.3
+# How far a prediction of a load may be off what was played, relative.
+_FAR_OFF = 0.25
+# Part of a truck, and of all ways, on unseen ground that is worth saying.
+_UNSEEN_TRUCK, _UNSEEN_WAYS = 0.2, 0.1
+# How deep an outline may be in something that is only that [m]: half a cell and some.
+_TOUCHES = -0.1
+
+
+def remarks_on(document: Mapping[str, Any], pile: Pile, site: Site) -> list[str]:
+    """What is worth knowing of a plan, sentences without their stops.
+
+    Args:
+        document: Content of its plan.json.
+        pile: The pile before the first loading.
+        site: With its receiver.
+    """
+    loads = document["loads"]
+    return [
+        *_empty(loads),
+        *_far_off(loads),
+        *_tight(loads),
+        *_unseen_ways(loads),
+        *_truck(pile, site, site.frame),
+    ]
+
+
+def _empty(loads: Sequence[Mapping[str, Any]]) -> list[str]:
+    masses = np.array([load["simulated"]["mass"] for load in loads])
+    little = np.flatnonzero(masses < _NEXT_TO_NOTHING * max(float(np.median(masses)), 1.0))
+    if not len(little):
+        return []
+    return [f"{_loads(little)} next to nothing: {_values(masses[little])} t"]
+
+
+def _far_off(loads: Sequence[Mapping[str, Any]]) -> list[str]:
+    if not all("predicted" in load for load in loads):
+        return []
+    predicted, played = (
+        np.array([[load[part][q] for q in ("mass", "time")] for load in loads])
+        for part in ("predicted", "simulated")
+    )
+    off = predicted / np.maximum(played, 1e-3) - 1.0
+    worst = np.abs(off).max(axis=1)
+    far = np.flatnonzero(worst > _FAR_OFF)
+    if not len(far):
+        return []
+    return [
+        f"{_loads(far, 'is', 'are')} predicted up to {100.0 * worst.max():.0f} % off what was "
+        f"played: go by what was played"
+    ]
+
+
+def _tight(loads: Sequence[Mapping[str, Any]]) -> list[str]:
+    clear = np.array([load.get("clearance", np.inf) for load in loads])
+    tight = np.flatnonzero(clear < _TOUCHES)
+    if not len(tight):
+        return []
+    return [
+        f"the way or the lane of {_loads(tight, '', '')}is not clear: the loader's outline is up "
+        f"to {-clear.min():.1f} m in soil or in what stands there; clear it first"
+    ]
+
+
+def _unseen_ways(loads: Sequence[Mapping[str, Any]]) -> list[str]:
+    paths = [load["path"] for load in loads if "path" in load]
+    length = sum(path["length"] for path in paths)
+    unseen = sum(path["unseen"] for path in paths)
+    if not paths or unseen < _UNSEEN_WAYS * length:
+        return []
+    return [
+        f"{100.0 * unseen / length:.0f} % of the ways lie on ground that the scan did not see: "
+        f"look before you drive there"
+    ]
+
+
+def _truck(pile: Pile, site: Site, frame: Frame) -> list[str]:
+    receiver = site.placed_receiver
+    place = np.array([[float(receiver.x), float(receiver.y), float(receiver.heading)]])
+    floor = np.asarray(pile.floor)
+    blocked = np.asarray(pile.height) - floor > CLEARED
+    on, unseen = truck_stands_on(
+        place, pile, blocked | standing(floor, pile.cell_size), site.machine
+    )
+    where = frame.place(place[0, 0], place[0, 1])
+    if on[0] > 0.0:
+        return [f"the truck that is loaded from {where} stands on the pile or on a structure"]
+    if unseen[0] > _UNSEEN_TRUCK:
+        return [f"the truck that is loaded from {where} stands where the scan saw nothing"]
+    return []
+
+
+def _loads(rows: np.ndarray, one: str = "yields", more: str = "yield") -> str:
+    """Loads by their numbers, counted from 1, and a verb."""
+    numbers = ", ".join(str(int(row) + 1) for row in rows[:8])
+    more_of_them = f" and {len(rows) - 8} more" if len(rows) > 8 else ""
+    verb = one if len(rows) == 1 else more
+    return f"load{'' if len(rows) == 1 else 's'} {numbers}{more_of_them} {verb}"
+
+
+def _values(values: np.ndarray) -> str:
+    return ", ".join(f"{value:.1f}" for value in values[:8])
