@@ -155,7 +155,9 @@ def test_a_bay_is_dug_from_its_open_side(tmp_path: Path) -> None:
     points, heading = contour.points[contour.accessible], contour.heading[contour.accessible]
     assert len(points) > 40
     assert (np.abs(points[:, 0] - 15.0) < 4.3).all()
-    assert (np.sin(heading) > 0.8).all()
+    # At the walls the toe turns along them, and with it the normal of its chord.
+    assert (np.sin(heading) > 0.5).all()
+    assert np.median(np.sin(heading)) > 0.99
 
 
 def test_what_was_taken_out_can_be_put_back(tmp_path: Path) -> None:

@@ -474,8 +474,8 @@ truck_option = click.option(
     type=Numbers("X,Y[,HEADING_DEG]", 2),
     default=None,
     help="Where the loader stands when it dumps [m], in the coordinates of the scan, and its "
-    "heading there. Default heading: the one with the shortest ways. Default place: 12 m west of "
-    "the pile.",
+    "heading there. Default heading: the one with the shortest ways. Default place: beside the "
+    "pile, where the ways are short.",
 )
 out_option = click.option(
     "--out", metavar="DIR", default=None, help="Folder to write to. It is made if it is missing."
