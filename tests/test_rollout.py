@@ -215,7 +215,7 @@ def test_the_simulator_rolls_out_under_the_same_signature(
 
 def cost_in(world: World, pile: Pile) -> Callable[[LoadingPlan], jax.Array]:
     """The objective of a plan, transport included."""
-    receiver = Receiver(*(jnp.asarray(v, pile.height.dtype) for v in (-18.0, -3.0, -0.5)))
+    receiver = Receiver(*(jnp.asarray(v, pile.height.dtype) for v in (-18.03, -3.07, -0.53)))
     job = make_job(world, pile, site=Site(receiver=receiver))
     return lambda plan: play_candidate(job, plan, report=False).cost
 

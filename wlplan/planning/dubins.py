@@ -64,7 +64,8 @@ def curve_between(
     # Where the arcs turn opposite ways, the line crosses between the circles.
     crossing = 0.5 * (s0 - s1)
     left = squared - (2.0 * radius * crossing) ** 2
-    exists = left >= 0.0
+    # Circles that touch leave no line between them, but for rounding.
+    exists = left >= -_SAME * radius**2
     # Two arcs of the same circle are one: the line between them has no direction.
     meets = squared < (_SAME * radius) ** 2
     straight = jnp.sqrt(jnp.where(left > 1e-12, left, 1e-12))

@@ -31,7 +31,6 @@ from wlplan.planning.yard import (
     Depths,
     Yard,
     depth_at,
-    depth_near,
     depths,
     is_standing,
     is_unseen,
@@ -113,7 +112,7 @@ def way_to(
     goal = (receiver.x, receiver.y, receiver.heading)
     cusps = _search(*lax.stop_gradient((start, goal)), room, machine)
     at = _placed(jax.tree.map(lambda leaf: leaf[:_BLENDED], cusps), start, goal)
-    last = _ways(at, start, goal, room, machine, smooth=True)
+    last = _ways(at, start, goal, room, machine)
     cost = last.length + _DETOUR * last.touching
     weight = jax.nn.softmax(-cost / _BLEND)
     best = jax.tree.map(lambda leaf: leaf[jnp.argmin(cost)], last)
@@ -157,7 +156,7 @@ def _search(start: _Place, goal: _Place, room: Room, machine: WheelLoader) -> _C
             jnp.where(number < 2, number == 0, jnp.repeat(at_start, _BEST)),
         )
         at = _placed(tried, start, goal)
-        ways = _ways(at, start, goal, room, machine, smooth=False)
+        ways = _ways(at, start, goal, room, machine)
         all_costs = jnp.concatenate([costs, ways.length + _DETOUR * ways.touching])
         _, rows = lax.top_k(-all_costs, _BEST)
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b])[rows], best[0], tried)
@@ -223,9 +222,7 @@ def _halton(count: int) -> Float[np.ndarray, "count 3"]:
     )
 
 
-def _ways(
-    cusps: _Place, start: _Place, goal: _Place, room: Room, machine: WheelLoader, *, smooth: bool
-) -> Way:
+def _ways(cusps: _Place, start: _Place, goal: _Place, room: Room, machine: WheelLoader) -> Way:
     """The shortest way by way of each cusp, and what it touches."""
     radius = machine.turning_radius
     shared = room.yard.origin[0]
@@ -240,8 +237,7 @@ def _ways(
         ahead = jnp.asarray([-third, 0.0, front], x.dtype)[:, None, None]
         return x[None] + ahead * c[None], y[None] + ahead * s[None]
 
-    look = depth_at if smooth else depth_near
-    depth = look(room.field, *discs(third))
+    depth = depth_at(room.field, *discs(third))
     # The raised bucket reaches over the side of the truck.
     depth += _depth_in_truck(*discs(third - machine.overhang), goal, room.yard.reach, machine)
     return Way(out, up, length, (depth.sum(axis=0) * weight).sum(axis=1))

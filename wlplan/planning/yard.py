@@ -11,6 +11,7 @@ import functools
 import math
 from typing import no_type_check
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -20,7 +21,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, UInt8
 from wlplan.site.machine import WheelLoader
 from wlplan.terrain.standing import CLEARED, pooled, standing
 from wlplan.types import Pile
-from wlplan.xla import floats
 
 # Cells of the yard come in multiples of so many along each side: what is compiled for one pile
 # serves the next.
@@ -51,19 +51,24 @@ def yard_of(
     """The yard around a pile.
 
     Args:
-        pile: The pile; what its ground is of does not change.
+        pile: The pile; what its ground is of does not change. Under a trace, where its ground is
+            not known, nothing stands.
         machine: What drives there.
         closed: Cells of the pile's grid that nothing may drive on; None: there are none.
     """
     reach = disc_radius(machine)
     cell = pile.cell_size * _COARSE
     border = _border(reach, cell)
-    stands = standing(np.asarray(pile.floor), pile.cell_size)
+    known = pile.ground is not None and not isinstance(pile.ground, jax.core.Tracer)
+    stands = np.zeros(pile.height.shape, bool)
+    if known:
+        stands = standing(np.asarray(pile.ground), pile.cell_size)
     if closed is not None:
         stands = stands | np.asarray(closed)
-    unseen = np.zeros_like(stands) if pile.valid is None else ~np.asarray(pile.valid)
+    unseen = np.zeros_like(stands)
+    if pile.valid is not None and not isinstance(pile.valid, jax.core.Tracer):
+        unseen = ~np.asarray(pile.valid)
     middle = 0.5 * (_COARSE - 1) * pile.cell_size
-    origin = np.asarray(pile.origin, np.float64) + middle - border * cell
 
     def flags(cells: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "n m"]:
         return pooled(cells.astype(np.int8), _COARSE) > 0
@@ -72,7 +77,7 @@ def yard_of(
     return Yard(
         standing=jnp.asarray(np.pad(flags(stands), width)),
         unseen=jnp.asarray(np.pad(flags(unseen), width, constant_values=True)),
-        origin=floats(origin),
+        origin=jnp.asarray(pile.origin, pile.height.dtype) + (middle - border * cell),
         cell=cell,
         reach=reach,
     )
@@ -126,14 +131,6 @@ def _most(values: Float[Array, "nx ny"]) -> Float[Array, "n m"]:
     grown = jnp.pad(values, ((0, -nx % _COARSE), (0, -ny % _COARSE)), mode="edge")
     parts = [grown[i::_COARSE, j::_COARSE] for i in range(_COARSE) for j in range(_COARSE)]
     return functools.reduce(jnp.maximum, parts)
-
-
-def depth_near(field: Depths, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The depth at the nearest cells; constant in between, free outside the map."""
-    n, m = field.depth.shape
-    i = jnp.clip(((x - field.origin[0]) / field.cell + 0.5).astype(jnp.int32), 0, n - 1)
-    j = jnp.clip(((y - field.origin[1]) / field.cell + 0.5).astype(jnp.int32), 0, m - 1)
-    return field.depth.reshape(-1)[i * m + j]
 
 
 def depth_at(field: Depths, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
