@@ -529,7 +529,7 @@ def test_the_soil_of_the_options_is_in_every_world_and_the_ledger(
     assert document["ledger"]["density"] == pytest.approx(SAND.density / 1000.0)
     assert document["soil"] == {"name": "sand", "parameters": dataclasses.asdict(SAND)}
     assert document["machine"] == {"name": "wa320", "parameters": dataclasses.asdict(WA320)}
-    assert err.count("note: ") == 1
+    assert err.count("trained for") == 1
     assert "trained for gravel and the WA320, not for sand:" in err
 
 
@@ -562,11 +562,12 @@ def test_without_options_it_is_gravel_and_the_wa320_and_nothing_is_told(
 ) -> None:
     _, out, err = run("plan", scan, "--loads", 1, "--json")
     assert {entry[1:] for entry in asked} == {(GRAVEL, WA320)}
-    assert "note" not in err
+    assert "trained for" not in err
     assert json.loads(out)["soil"]["name"] == "gravel"
     # The simulator was trained for nothing.
     assert (
-        "note" not in run("plan", scan, "--loads", 1, "--world", "simulator", "--soil", "clay")[2]
+        "trained for"
+        not in run("plan", scan, "--loads", 1, "--world", "simulator", "--soil", "clay")[2]
     )
 
 
