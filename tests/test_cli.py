@@ -529,7 +529,6 @@ def test_the_soil_of_the_options_is_in_every_world_and_the_ledger(
     assert document["ledger"]["density"] == pytest.approx(SAND.density / 1000.0)
     assert document["soil"] == {"name": "sand", "parameters": dataclasses.asdict(SAND)}
     assert document["machine"] == {"name": "wa320", "parameters": dataclasses.asdict(WA320)}
-    assert err.count("trained for") == 1
     assert "trained for gravel and the WA320, not for sand:" in err
 
 

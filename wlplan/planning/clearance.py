@@ -35,31 +35,56 @@ def clearance(
         receiver: x [m], y [m] and heading [rad].
         machine: What drives.
     """
-    cells = np.argwhere(blocked) * pile.cell_size + np.asarray(pile.origin, float)
     half_cell = 0.5 * pile.cell_size
     half, side = 0.5 * machine.length, 0.5 * machine.bucket_width
-    reach = half + side + FARTHEST
-    low, high = points[:, :2].min(axis=0) - reach, points[:, :2].max(axis=0) + reach
-    on_way = cells[((cells >= low) & (cells <= high)).all(axis=1)]
-    least = FARTHEST
-    for place in points[:, :3]:
-        least = min(least, _distance(place, on_way, -half, half, side) - half_cell)
-    # The truck, but for what the raised bucket reaches over.
-    near, far, along = truck_outline(machine)
-    spread = np.meshgrid(
-        np.linspace(near, far, 2 + int((far - near) / pile.cell_size)),
-        np.linspace(-along, along, 2 + int(2.0 * along / pile.cell_size)),
-        indexing="ij",
-    )
-    truck = _from_frame(receiver, np.stack([axis.ravel() for axis in spread], axis=-1))
-    for place in points[:, :3]:
-        least = min(least, _distance(place, truck, -half, half - machine.overhang, side))
     back = -machine.approach_distance - half
+    least = way_clearance(points, blocked, pile, receiver, machine)
+    cells, truck = _places(blocked, pile), _truck(receiver, pile.cell_size, machine)
     for others, width in ((cells, half_cell), (truck, 0.0)):
         ahead, _ = _to_frame(dig, others).T
         behind = others[ahead <= -LANE_END - half_cell]
         least = min(least, _distance(dig, behind, back, -LANE_END, side) - width)
     return least
+
+
+def way_clearance(
+    points: Float[np.ndarray, "n 4"],
+    blocked: Bool[np.ndarray, "nx ny"],
+    pile: Pile,
+    receiver: Float[np.ndarray, "3"],
+    machine: WheelLoader,
+) -> float:
+    """Least distance from the outline to anything on the way alone, as `clearance` [m]."""
+    half, side = 0.5 * machine.length, 0.5 * machine.bucket_width
+    cells, truck = _places(blocked, pile), _truck(receiver, pile.cell_size, machine)
+    reach = half + side + FARTHEST
+    low, high = points[:, :2].min(axis=0) - reach, points[:, :2].max(axis=0) + reach
+    near = cells[((cells >= low) & (cells <= high)).all(axis=1)]
+    least = FARTHEST
+    for place in points[:, :3]:
+        least = min(least, _distance(place, near, -half, half, side) - 0.5 * pile.cell_size)
+        # The raised bucket reaches over the truck.
+        least = min(least, _distance(place, truck, -half, half - machine.overhang, side))
+    return least
+
+
+def _places(blocked: Bool[np.ndarray, "nx ny"], pile: Pile) -> Float[np.ndarray, "k 2"]:
+    """The middles of cells [m]."""
+    places: np.ndarray = np.argwhere(blocked) * pile.cell_size + np.asarray(pile.origin, float)
+    return places
+
+
+def _truck(
+    receiver: Float[np.ndarray, "3"], spacing: float, machine: WheelLoader
+) -> Float[np.ndarray, "k 2"]:
+    """Places all over the truck [m]."""
+    near, far, along = truck_outline(machine)
+    spread = np.meshgrid(
+        np.linspace(near, far, 2 + int((far - near) / spacing)),
+        np.linspace(-along, along, 2 + int(2.0 * along / spacing)),
+        indexing="ij",
+    )
+    return _from_frame(receiver, np.stack([axis.ravel() for axis in spread], axis=-1))
 
 
 def _distance(
