@@ -69,8 +69,12 @@ def curve_between(
     # Two arcs of the same circle are one: the line between them has no direction.
     meets = squared < (_SAME * radius) ** 2
     straight = jnp.sqrt(jnp.where(left > 1e-12, left, 1e-12))
-    bearing = jnp.arctan2(jnp.where(meets, jnp.sin(a0), dy), jnp.where(meets, jnp.cos(a0), dx))
-    line = bearing + crossing * jnp.arctan2(2.0 * radius * jnp.ones_like(straight), straight)
+    # From the line between the centres to the one that is driven, as a product of complex numbers:
+    # an arc tangent is what takes most of the time.
+    turn = 2.0 * radius * crossing
+    cosine = jnp.where(meets, jnp.cos(a0), dx * straight - dy * turn)
+    sine = jnp.where(meets, jnp.sin(a0), dy * straight + dx * turn)
+    line = jnp.arctan2(sine, cosine)
     first, last = s0 * _positive(s0 * (line - a0)), s1 * _positive(s1 * (a1 - line))
     return Curve(*jnp.broadcast_arrays(x0, y0, a0, first, straight, last)), exists
 

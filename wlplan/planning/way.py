@@ -4,8 +4,8 @@ A way is two curves of Dubins that meet in a cusp, where the loader changes from
 out of the pile backwards (arc, straight line, arc), and up to the receiver forwards. What is left
 to choose is the cusp. A fan of cusps is tried: reverse straight and then along an arc, and the
 shortest way from there; the same from the receiver's end; and reverse around two arcs. The best
-are shifted a little, twice, as the last of them are to be good. A way costs its length, and what
-it touches.
+are shifted, by less and less. A way costs its length, and what it touches. `experiments/ways.py`
+holds what is found against a search of all ways of one cusp.
 
 Points of a way are the middle of the loader. It stands `approach_distance` behind the dig location
 when the loading has ended.
@@ -16,6 +16,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Callable, Iterator
 from typing import NamedTuple, no_type_check
 
 import jax
@@ -31,6 +32,7 @@ from wlplan.planning.yard import (
     Depths,
     Yard,
     depth_at,
+    depth_near,
     depths,
     is_standing,
     is_unseen,
@@ -44,17 +46,19 @@ from wlplan.xla import materialize
 
 # The fan. Reversing straight [m] and then along an arc [degrees], from either end; and around an
 # arc, straight on and around another arc, likewise.
-_STRAIGHT = (0.0, 3.0, 6.5, 11.0, 16.0)
+_STRAIGHT = (0.0, 2.0, 4.0, 7.0, 11.0, 16.0)
 _ARC = (0.0, 15.0, 30.0, 45.0, 65.0, 90.0, 120.0)
-_TWICE = ((35.0, 70.0), (0.0, 4.0), (0.0, 40.0, 80.0, 120.0))
-# By how much the best cusps are shifted at most [m] and turned [rad], in one round after the other;
-# each to as many places around as there are of them, which makes a round as large as the fan.
-_ROUNDS = ((2.0, 0.45), (0.7, 0.15))
-_BEST = 11
-# Places on each of the two curves where the loader is looked at.
-_LOOKS = 14
-# Metres of way that one metre in the middle of an obstacle is worth: no way around is longer.
-_DETOUR = 20.0
+_TWICE = ((30.0, 60.0, 90.0), (0.0, 4.0), (0.0, 40.0, 80.0, 120.0))
+# The best cusps are shifted, each to so many places, by at most so much [m] and turned by at most
+# so much [rad], in one round after the other.
+_BEST, _SHIFTS = 8, 12
+_ROUNDS = ((2.0, 0.45), (1.3, 0.3), (0.8, 0.18), (0.45, 0.1), (0.2, 0.05))
+# Places on each arc, and on the line between, where the loader is looked at: as it is three discs
+# in a row, they leave no gap on a line of 20 m.
+_LOOKS = 4
+# Metres of way that one metre in the middle of an obstacle is worth: no way around is longer, also
+# where a corner is only grazed.
+_DETOUR = 100.0
 # The lane is looked at in steps of this length, and soil this much higher than can be driven over
 # counts in full [m].
 _LANE_STEP, _LANE_RAMP = 0.4, 0.1
@@ -112,7 +116,7 @@ def way_to(
     goal = (receiver.x, receiver.y, receiver.heading)
     cusps = _search(*lax.stop_gradient((start, goal)), room, machine)
     at = _placed(jax.tree.map(lambda leaf: leaf[:_BLENDED], cusps), start, goal)
-    last = _ways(at, start, goal, room, machine)
+    last = _ways(at, start, goal, room, machine, _depth)
     cost = last.length + _DETOUR * last.touching
     weight = jax.nn.softmax(-cost / _BLEND)
     best = jax.tree.map(lambda leaf: leaf[jnp.argmin(cost)], last)
@@ -121,6 +125,12 @@ def way_to(
 
 _Place = tuple[Array, Array, Array]
 """X [m], y [m] and heading [rad]."""
+
+
+_Placed = tuple[Array, Array, Array, Array]
+"""X [m], y [m], cosine and sine of the heading."""
+
+_DepthOf = Callable[[_Placed, _Place, Room, WheelLoader], Array]
 
 
 class _Cusps(NamedTuple):
@@ -143,38 +153,36 @@ def _search(start: _Place, goal: _Place, room: Room, machine: WheelLoader) -> _C
 
     One loop over rounds of one size: its body is compiled once.
     """
-    dtype = start[0].dtype
-    fan = jnp.asarray(_fan(machine.turning_radius), dtype)
-    places = jnp.asarray(_halton(_BEST), dtype)
-    scales = jnp.asarray([(0.0, 0.0, 0.0)] * 2 + [(d, d, turn) for d, turn in _ROUNDS], dtype)
+    dtype, size = start[0].dtype, _BEST * _SHIFTS
+    fan = _fan(machine.turning_radius)
+    both = _Cusps(
+        jnp.asarray(np.tile(fan, (2, 1)), dtype), jnp.asarray(np.arange(2 * len(fan)) < len(fan))
+    )
+    rounds = jnp.asarray(_halton(len(_ROUNDS) * size).reshape(-1, size, 3), dtype)
+    rounds *= jnp.asarray([(far, far, turn) for far, turn in _ROUNDS], dtype)[:, None]
 
-    def one(best: tuple[_Cusps, Array], number: Array) -> tuple[tuple[_Cusps, Array], None]:
+    def costs_of(cusps: _Cusps) -> Array:
+        ways = _ways(_placed(cusps, start, goal), start, goal, room, machine, _depth_near)
+        return ways.length + _DETOUR * ways.touching
+
+    def best_of(cusps: _Cusps, costs: Array) -> tuple[_Cusps, Array]:
+        _, rows = lax.top_k(-costs, _BEST)
+        return jax.tree.map(lambda leaf: leaf[rows], cusps), costs[rows]
+
+    def shift(best: tuple[_Cusps, Array], shifts: Array) -> tuple[tuple[_Cusps, Array], None]:
         (local, at_start), costs = best
-        around = (local[:, None] + (scales[number][None] * places)[None]).reshape(-1, 3)
-        tried = _Cusps(
-            jnp.where(number < 2, fan, around),
-            jnp.where(number < 2, number == 0, jnp.repeat(at_start, _BEST)),
-        )
-        at = _placed(tried, start, goal)
-        ways = _ways(at, start, goal, room, machine)
-        all_costs = jnp.concatenate([costs, ways.length + _DETOUR * ways.touching])
-        _, rows = lax.top_k(-all_costs, _BEST)
-        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b])[rows], best[0], tried)
-        return (both, all_costs[rows]), None
+        tried = _Cusps(jnp.repeat(local, _SHIFTS, axis=0) + shifts, jnp.repeat(at_start, _SHIFTS))
+        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), best[0], tried)
+        return best_of(both, jnp.concatenate([costs, costs_of(tried)])), None
 
-    none = _Cusps(jnp.zeros((_BEST, 3), dtype), jnp.zeros(_BEST, bool))
-    first = none, jnp.full(_BEST, jnp.inf, dtype)
-    (cusps, _), _ = lax.scan(one, first, jnp.arange(2 + len(_ROUNDS)))
+    (cusps, _), _ = lax.scan(shift, best_of(both, costs_of(both)), rounds)
     return cusps
 
 
 @functools.cache
 def _fan(radius: float) -> Float[np.ndarray, "k 3"]:
-    """The cusps that are tried first, in the frame of an end."""
+    """The cusps that are tried first, in the frame of an end, and the ways back from them [m]."""
     straight, arc = np.meshgrid(_STRAIGHT, np.radians(_either_way(_ARC)), indexing="ij")
-    none = np.zeros(arc.size)
-    origin = none, none, none
-    single = _reverse(origin, straight.ravel(), arc.ravel(), radius)
     first, middle, last = (
         axis.ravel()
         for axis in np.meshgrid(
@@ -184,11 +192,12 @@ def _fan(radius: float) -> Float[np.ndarray, "k 3"]:
             indexing="ij",
         )
     )
+    straight = np.concatenate([straight.ravel(), middle])
+    last = np.concatenate([arc.ravel(), last])
+    first = np.concatenate([np.zeros(arc.size), first])
     none = np.zeros(first.size)
-    double = _reverse(_reverse((none, none, none), none, first, radius), middle, last, radius)
-    fan = np.concatenate([np.stack(single, axis=-1), np.stack(double, axis=-1)])
-    assert len(fan) == _BEST**2, "a round is as large as the fan"
-    return fan
+    turned = _reverse((none, none, none), none, first, radius)
+    return np.stack(_reverse(turned, straight, last, radius), axis=-1)
 
 
 def _either_way(angles: tuple[float, ...]) -> list[float]:
@@ -222,61 +231,112 @@ def _halton(count: int) -> Float[np.ndarray, "count 3"]:
     )
 
 
-def _ways(cusps: _Place, start: _Place, goal: _Place, room: Room, machine: WheelLoader) -> Way:
+def _ways(
+    cusps: _Place,
+    start: _Place,
+    goal: _Place,
+    room: Room,
+    machine: WheelLoader,
+    depth_of: _DepthOf,
+) -> Way:
     """The shortest way by way of each cusp, and what it touches."""
     radius = machine.turning_radius
     shared = room.yard.origin[0]
-    out, up = materialize([_shortest(cusps, end, radius) for end in (start, goal)], shared)
-    length = dubins.length_of(out, radius) + dubins.length_of(up, radius)
-    parts = [_looks(curve, radius) for curve in (out, up)]
-    looks = [jnp.concatenate(leaves, axis=1) for leaves in zip(*parts, strict=True)]
-    x, y, c, s, weight = materialize(looks, shared)
+    x0, y0, heading0 = (leaf[None] for leaf in cusps)
+    x1, y1, heading1 = (jnp.stack(pair)[:, None] for pair in zip(start, goal, strict=True))
+    both = materialize(_shortest((x0, y0, heading0), (x1, y1, heading1), radius), shared)
+    touching = jnp.zeros_like(cusps[0])
+    for looks in _looks(both, radius, shared):
+        x, y, c, s, weight = materialize(looks, shared)
+        depth = depth_of((x, y, c, s), goal, room, machine)
+        touching += (depth * weight).sum(axis=(0, 1))
+    out, up = (jax.tree.map(lambda leaf, k=k: leaf[k], both) for k in (0, 1))
+    return Way(out, up, dubins.length_of(both, radius).sum(axis=0), touching)
+
+
+def _discs(machine: WheelLoader) -> tuple[tuple[float, float], ...]:
+    """How far ahead of its middle the discs of a loader are [m], and where the truck is met.
+
+    The raised bucket reaches over the side of the truck.
+    """
     third = machine.length / 3.0
+    return (-third, -third), (0.0, 0.0), (third, third - machine.overhang)
 
-    def discs(front: float) -> tuple[Array, Array]:
-        ahead = jnp.asarray([-third, 0.0, front], x.dtype)[:, None, None]
-        return x[None] + ahead * c[None], y[None] + ahead * s[None]
 
-    depth = depth_at(room.field, *discs(third))
-    # The raised bucket reaches over the side of the truck.
-    depth += _depth_in_truck(*discs(third - machine.overhang), goal, room.yard.reach, machine)
-    return Way(out, up, length, (depth.sum(axis=0) * weight).sum(axis=1))
+def _depth_near(place: _Placed, goal: _Place, room: Room, machine: WheelLoader) -> Array:
+    """How deep the loader is in what it must not touch, over its three discs; without derivatives.
+
+    Args:
+        place: Its middle and heading.
+        goal: Where it dumps.
+        room: Around the pile.
+        machine: The loader.
+    """
+    x, y, c, s = place
+    depth = jnp.zeros(())
+    # Disc by disc: XLA makes faster code of it than of an axis of discs.
+    for ahead, at_truck in _discs(machine):
+        depth = depth + depth_near(room.field, x + ahead * c, y + ahead * s)
+        truck = x + at_truck * c, y + at_truck * s
+        depth = depth + _depth_in_truck(*truck, goal, room.yard.reach, machine)
+    return depth
+
+
+def _depth(place: _Placed, goal: _Place, room: Room, machine: WheelLoader) -> Array:
+    """`_depth_near`, but smooth in the place and the goal."""
+    x, y, c, s = (leaf[None] for leaf in place)
+    ahead, at_truck = (
+        jnp.asarray(row, x.dtype).reshape(-1, *[1] * (x.ndim - 1))
+        for row in zip(*_discs(machine), strict=True)
+    )
+    depth = depth_at(room.field, x + ahead * c, y + ahead * s)
+    truck = x + at_truck * c, y + at_truck * s
+    depth += _depth_in_truck(*truck, goal, room.yard.reach, machine)
+    return depth.sum(axis=0)
 
 
 def _shortest(start: _Place, end: _Place, radius: float) -> Curve:
-    """The shortest curve from each start to the one end."""
-    x, y, heading = (leaf[:, None] for leaf in start)
-    words = jnp.asarray(WORDS, start[0].dtype)[None]
-    curves, exists = curve_between((x, y, heading), end, words, radius)
+    """The shortest curve from each start to each end, of the shape that both broadcast to."""
+    shape = jnp.broadcast_shapes(start[0].shape, end[0].shape)
+    words = jnp.asarray(WORDS, start[0].dtype).reshape(len(WORDS), *[1] * len(shape), 2)
+    x0, y0, heading0 = (leaf[None] for leaf in start)
+    x1, y1, heading1 = (leaf[None] for leaf in end)
+    curves, exists = curve_between((x0, y0, heading0), (x1, y1, heading1), words, radius)
     lengths = jnp.where(exists, dubins.length_of(curves, radius), jnp.inf)
-    row = jnp.argmin(lengths, axis=1)[:, None]
+    row = jnp.argmin(lengths, axis=0)[None]
 
     def pick(leaf: Array) -> Array:
-        return jnp.take_along_axis(jnp.broadcast_to(leaf, lengths.shape), row, axis=1)[:, 0]
+        return jnp.take_along_axis(jnp.broadcast_to(leaf, lengths.shape), row, axis=0)[0]
 
     picked: Curve = jax.tree.map(pick, curves)
     return picked
 
 
-def _looks(curve: Curve, radius: float) -> tuple[Array, ...]:
-    """Places along curves: x, y, cosine and sine of the heading, and the length each stands for."""
-    heading, first, straight, last = (
-        leaf[:, None] for leaf in (curve.heading, curve.first, curve.straight, curve.last)
-    )
-    length = dubins.length_of(curve, radius)[:, None]
-    distance = length * jnp.asarray((np.arange(_LOOKS) + 0.5) / _LOOKS, length.dtype)[None]
-    arc = radius * jnp.abs(first)
-    # The heading on the first arc, or at its end; and then on the last one.
-    turned = heading + jnp.sign(first) * jnp.minimum(distance, arc) / radius
-    there = turned + jnp.sign(last) * jnp.maximum(distance - arc - straight, 0.0) / radius
-    on_line = jnp.clip(distance - arc, 0.0, straight)
-    side, other = radius * jnp.sign(first), radius * jnp.sign(last)
-    c1, s1, c, s = jnp.cos(turned), jnp.sin(turned), jnp.cos(there), jnp.sin(there)
-    line = heading + first
-    x = curve.x[:, None] + side * (s1 - jnp.sin(heading)) + on_line * jnp.cos(line)
-    y = curve.y[:, None] - side * (c1 - jnp.cos(heading)) + on_line * jnp.sin(line)
-    weight = jnp.broadcast_to(length / _LOOKS, c.shape)
-    return x + other * (s - s1), y - other * (c - c1), c, s, weight
+_Looks = tuple[Array, Array, Array, Array, Array]
+"""X [m], y [m], cosine and sine of the heading, and the length each place stands for [m]."""
+
+
+def _looks(curve: Curve, radius: float, shared: Array) -> Iterator[_Looks]:
+    """Places along the first arc of curves, the line and the last arc, on a new first axis."""
+    curve = jax.tree.map(lambda leaf: leaf[None], curve)
+    h0, h1 = curve.heading, curve.heading + curve.first
+    c0, s0, c1, s1 = materialize((jnp.cos(h0), jnp.sin(h0), jnp.cos(h1), jnp.sin(h1)), shared)
+    part = jnp.asarray((np.arange(_LOOKS) + 0.5) / _LOOKS, h0.dtype)
+    part = part.reshape(-1, *[1] * (h0.ndim - 1))
+
+    def on_arc(x: Array, y: Array, c: Array, s: Array, heading: Array, turn: Array) -> _Looks:
+        side, there = radius * jnp.sign(turn), heading + part * turn
+        ct, st = jnp.cos(there), jnp.sin(there)
+        weight = radius * jnp.abs(turn) / _LOOKS
+        return x + side * (st - s), y - side * (ct - c), ct, st, weight
+
+    yield on_arc(curve.x, curve.y, c0, s0, h0, curve.first)
+    side = radius * jnp.sign(curve.first)
+    x, y = curve.x + side * (s1 - s0), curve.y - side * (c1 - c0)
+    far = part * curve.straight
+    yield x + far * c1, y + far * s1, c1, s1, curve.straight / _LOOKS
+    x, y = x + curve.straight * c1, y + curve.straight * s1
+    yield on_arc(x, y, c1, s1, h1, curve.last)
 
 
 def _depth_in_truck(x: Array, y: Array, goal: _Place, reach: float, machine: WheelLoader) -> Array:
@@ -329,8 +389,8 @@ def unseen_along(way: Way, yard: Yard, radius: float) -> Float[Array, ""]:
     """Length of one way over ground that the scan did not see [m]."""
     total = jnp.zeros((), way.length.dtype)
     for curve in (way.out, way.up):
-        x, y, _, _, weight = _looks(jax.tree.map(lambda leaf: leaf[None], curve), radius)
-        total = total + (is_unseen(yard, x, y) * weight).sum()
+        for x, y, _, _, weight in _looks(curve, radius, yard.origin[0]):
+            total = total + (is_unseen(yard, x, y) * weight).sum()
     return total
 
 

@@ -147,6 +147,14 @@ def depth_at(field: Depths, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Flo
     return (1.0 - a) * low + a * high
 
 
+def depth_near(field: Depths, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The depth of the cell that places are in: a fifth of the time of `depth_at`, but it jumps."""
+    n, m = field.depth.shape
+    i = jnp.clip(((x - field.origin[0]) / field.cell + 0.5).astype(jnp.int32), 0, n - 1)
+    j = jnp.clip(((y - field.origin[1]) / field.cell + 0.5).astype(jnp.int32), 0, m - 1)
+    return field.depth.reshape(-1)[i * m + j]
+
+
 def is_unseen(yard: Yard, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Bool[Array, "*n"]:
     """Whether places lie where the scan saw nothing, or outside it."""
     return _flag_near(yard.unseen, yard, x, y)
