@@ -1,6 +1,7 @@
 """Terms of an objective: functions of one loading to one number, the smaller the better.
 
-The three of the follow-up are here. References make them comparable: the means of the follow-up's
+The three of the follow-up are here, and room to drive; `wlplan.planning.face` has those of a face
+that is worked well. References make them comparable: the means of the follow-up's
 greedy plan, 64.4 t, 694 s and 15.5 MJ over 15 loads.
 """
 
@@ -12,6 +13,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from wlplan.planning.face import oblique, slot, undercut
 from wlplan.planning.loading import Loading
 
 Term = Callable[[Loading], Float[Array, ""]]
@@ -66,5 +68,8 @@ TERMS: dict[str, Term] = {
     "time": CycleTime(),
     "work": CycleWork(),
     "touching": touching,
+    "slot": slot,
+    "oblique": oblique,
+    "undercut": undercut,
 }
 """Terms by name."""

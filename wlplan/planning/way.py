@@ -29,11 +29,13 @@ from jaxtyping import Array, Bool, Float
 from wlplan.planning import dubins
 from wlplan.planning.dubins import WORDS, Curve, curve_between
 from wlplan.planning.yard import (
+    DISCS,
     Depths,
     Yard,
     depth_at,
     depth_near,
     depths,
+    disc_radius,
     is_standing,
     is_unseen,
 )
@@ -53,9 +55,9 @@ _TWICE = ((30.0, 60.0, 90.0), (0.0, 4.0), (0.0, 40.0, 80.0, 120.0))
 # so much [rad], in one round after the other.
 _BEST, _SHIFTS = 8, 12
 _ROUNDS = ((2.0, 0.45), (1.3, 0.3), (0.8, 0.18), (0.45, 0.1), (0.2, 0.05))
-# Places on each arc, and on the line between, where the loader is looked at: as it is three discs
-# in a row, they leave no gap on a line of 20 m.
-_LOOKS = 4
+# Places on each arc, and on the line between, where the loader is looked at. As it is a row of
+# discs, they leave no gap on a line of 20 m; on an arc its corners swing out between them.
+_ON_ARC, _ON_LINE = 6, 4
 # Metres of way that one metre in the middle of an obstacle is worth: no way around is longer, also
 # where a corner is only grazed.
 _DETOUR = 100.0
@@ -254,17 +256,19 @@ def _ways(
     return Way(out, up, dubins.length_of(both, radius).sum(axis=0), touching)
 
 
-def _discs(machine: WheelLoader) -> tuple[tuple[float, float], ...]:
-    """How far ahead of its middle the discs of a loader are [m], and where the truck is met.
+def _discs(machine: WheelLoader) -> list[tuple[float, float]]:
+    """How far ahead of its middle the discs of a loader are, and where they are for the truck [m].
 
-    The raised bucket reaches over the side of the truck.
+    The raised bucket reaches over the side of the truck: the foremost disc ends where it does when
+    the loader dumps.
     """
-    third = machine.length / 3.0
-    return (-third, -third), (0.0, 0.0), (third, third - machine.overhang)
+    side, _, _ = truck_outline(machine)
+    ahead = machine.length * ((np.arange(DISCS) + 0.5) / DISCS - 0.5)
+    return [(float(a), min(float(a), side - disc_radius(machine))) for a in ahead]
 
 
 def _depth_near(place: _Placed, goal: _Place, room: Room, machine: WheelLoader) -> Array:
-    """How deep the loader is in what it must not touch, over its three discs; without derivatives.
+    """How deep the loader is in what it must not touch, over its discs; without derivatives.
 
     Args:
         place: Its middle and heading.
@@ -321,20 +325,22 @@ def _looks(curve: Curve, radius: float, shared: Array) -> Iterator[_Looks]:
     curve = jax.tree.map(lambda leaf: leaf[None], curve)
     h0, h1 = curve.heading, curve.heading + curve.first
     c0, s0, c1, s1 = materialize((jnp.cos(h0), jnp.sin(h0), jnp.cos(h1), jnp.sin(h1)), shared)
-    part = jnp.asarray((np.arange(_LOOKS) + 0.5) / _LOOKS, h0.dtype)
-    part = part.reshape(-1, *[1] * (h0.ndim - 1))
+
+    def parts(count: int) -> Array:
+        part = jnp.asarray((np.arange(count) + 0.5) / count, h0.dtype)
+        return part.reshape(-1, *[1] * (h0.ndim - 1))
 
     def on_arc(x: Array, y: Array, c: Array, s: Array, heading: Array, turn: Array) -> _Looks:
-        side, there = radius * jnp.sign(turn), heading + part * turn
+        side, there = radius * jnp.sign(turn), heading + parts(_ON_ARC) * turn
         ct, st = jnp.cos(there), jnp.sin(there)
-        weight = radius * jnp.abs(turn) / _LOOKS
+        weight = radius * jnp.abs(turn) / _ON_ARC
         return x + side * (st - s), y - side * (ct - c), ct, st, weight
 
     yield on_arc(curve.x, curve.y, c0, s0, h0, curve.first)
     side = radius * jnp.sign(curve.first)
     x, y = curve.x + side * (s1 - s0), curve.y - side * (c1 - c0)
-    far = part * curve.straight
-    yield x + far * c1, y + far * s1, c1, s1, curve.straight / _LOOKS
+    far = parts(_ON_LINE) * curve.straight
+    yield x + far * c1, y + far * s1, c1, s1, curve.straight / _ON_LINE
     x, y = x + curve.straight * c1, y + curve.straight * s1
     yield on_arc(x, y, c1, s1, h1, curve.last)
 
@@ -374,9 +380,10 @@ def lane_touching(
     dtype = pile.height.dtype
     first, last = -machine.approach_distance - 0.5 * machine.length, -LANE_END
     rows = max(round((last - first) / _LANE_STEP), 1)
-    columns = max(round(machine.bucket_width / _LANE_STEP), 1)
+    columns = max(round(machine.bucket_width / _LANE_STEP), 1) + 1
     along = jnp.asarray(first + (last - first) * (np.arange(rows) + 0.5) / rows, dtype)
-    left = machine.bucket_width * ((np.arange(columns) + 0.5) / columns - 0.5)
+    # From edge to edge, and a little further.
+    left = (machine.bucket_width + _LANE_RAMP) * np.linspace(-0.5, 0.5, columns)
     x, y = to_world(pose, *jnp.meshgrid(along, jnp.asarray(left, dtype), indexing="ij"))
     soil = jnp.clip((sample(pile.height - pile.floor, pile, x, y) - CLEARED) / _LANE_RAMP, 0.0, 1.0)
     goal = receiver.x, receiver.y, receiver.heading

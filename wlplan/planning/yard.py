@@ -40,9 +40,16 @@ class Yard(struct.PyTreeNode):
     reach: float = struct.field(pytree_node=False)  # radius of the disc [m]
 
 
+DISCS = 4
+"""Discs in a row that cover the outline of a loader: with fewer they are wider than it."""
+
+# By how much they are larger: a loader is looked at in places, and what stands on coarse cells [m].
+_MARGIN = 0.1
+
+
 def disc_radius(machine: WheelLoader) -> float:
-    """Radius of the discs that cover the outline of a loader, three of them in a row [m]."""
-    return math.hypot(0.5 * machine.bucket_width, machine.length / 6.0)
+    """Radius of the discs [m]."""
+    return math.hypot(0.5 * machine.bucket_width, 0.5 * machine.length / DISCS) + _MARGIN
 
 
 def yard_of(
