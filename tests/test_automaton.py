@@ -190,6 +190,24 @@ def test_an_avalanche_that_leaves_the_window_goes_on_beyond() -> None:
     assert_volume_kept(jax.lax.dynamic_update_slice(pile.height, dug.height, start), after.height)
 
 
+def test_a_pile_steeper_than_its_soil_slides_without_steps_at_windows() -> None:
+    """What is beside a window is not left standing over it."""
+    x, y = np.meshgrid(*(0.1 * np.arange(160) - 8.0,) * 2, indexing="ij")
+    pile = Pile(jnp.asarray(np.maximum(5.0 - np.hypot(x, y), 0.0), jnp.float32), 0.1, (-8.0, -8.0))
+    pose = Pose(*(jnp.float32(v) for v in (-4.8, 0.0, 0.0)))
+    window, start = window_of(pile, pose)
+    take = jax.jit(excavate, static_argnames="width")
+    dug = take(window, pose, jnp.float32(3.0), width=WA320.bucket_width).pile
+    settled = settle_dug(pile, dug.height, start)
+    assert bool(settled.at_rest)
+    # 45 degrees before; and where it slid, it is at rest but for a few places.
+    after = np.asarray(settled.pile.height, np.float64)
+    steps = np.concatenate([np.abs(np.diff(after, axis=axis)).ravel() for axis in (0, 1)])
+    assert steps.max() < 0.1
+    assert (steps > 0.1 * math.tan(math.radians(33.1))).mean() < 0.01
+    assert (after != np.asarray(pile.height)).mean() > 0.4
+
+
 def test_a_tighter_tolerance_is_met() -> None:
     for degrees in (0.2, 0.5, 3.0):
         schedule = Schedule(tolerance=math.radians(degrees), most_rounds=50)

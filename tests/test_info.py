@@ -93,6 +93,17 @@ def test_structures_are_named_and_are_no_volume(tmp_path: Path) -> None:
     assert found["steepest_slope_deg"] < 40.0
 
 
+def test_a_pile_steeper_than_its_soil_is_said_to_be_with_a_choice(tmp_path: Path) -> None:
+    steep = save(tmp_path / "a.npz", np.maximum(3.0 - np.hypot(X - 12.0, Y - 12.0), 0.0))
+    found = wlplan.info(steep)
+    assert found["steepest_slope_deg"] == pytest.approx(45.0, abs=1.0)
+    (note,) = (note for note in found["notes"] if "degrees" in note)
+    choice = note.rpartition("NAME@")[2].split()[0]
+    assert float(choice) == pytest.approx(45.0, abs=1.0)
+    at_rest = wlplan.info(steep, soil=wlplan.soil_named(f"gravel@{choice}"))
+    assert not any("degrees" in note for note in at_rest["notes"])
+
+
 def test_the_command_needs_no_jax() -> None:
     code = (
         "import sys; from wlplan.cli import main; code = main(['info', '--json']); "

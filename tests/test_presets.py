@@ -150,6 +150,19 @@ def test_a_preset_goes_before_a_file_of_its_name(
     assert soil_named("./sand") == dataclasses.replace(GRAVEL, density=1600.0)
 
 
+def test_a_soil_may_rest_at_another_angle(write: Callable[..., Path]) -> None:
+    steep = soil_named("sand@45")
+    assert steep.repose_angle == pytest.approx(math.radians(45.0))
+    assert dataclasses.replace(steep, friction=SAND.friction) == SAND
+    own = write("density = 1500.0")
+    assert soil_named(f"{own}@40") == dataclasses.replace(
+        soil_named(own), friction=math.radians(40.0)
+    )
+    for name, word in (("sand@", "no angle"), ("sand@x", "no angle"), ("sand@80", "5 to 60")):
+        with pytest.raises(InputError, match=word):
+            soil_named(name)
+
+
 def test_the_ends_of_a_range_count_as_inside(write: Callable[..., Path]) -> None:
     assert math.degrees(soil_named(write("friction_deg = 60")).friction) == pytest.approx(60.0)
     assert machine_named(write("bucket_width = 5.2")).bucket_width == 5.2

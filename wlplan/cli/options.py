@@ -322,9 +322,10 @@ def site_options(default: str = "") -> tuple[Callable[[Any], Any], Callable[[Any
     return (
         click.option(
             "--soil",
-            metavar="NAME|FILE.toml",
+            metavar="NAME|FILE.toml[@DEG]",
             default=None,
-            help=f"Soil: {', '.join(SOILS)}, or a TOML file of parameters. Default: {soil}.",
+            help=f"Soil: {', '.join(SOILS)}, or a TOML file of parameters; @DEG: what it rests at. "
+            f"Default: {soil}.",
         ),
         click.option(
             "--machine",

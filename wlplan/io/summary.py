@@ -13,13 +13,14 @@ import os
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from wlplan.constants import KG_PER_TONNE
 from wlplan.io.contents import Contents
 from wlplan.io.survey import Survey, read_survey
 from wlplan.site.soil import GRAVEL, Soil
 from wlplan.terrain.parts import Part, find_parts
+from wlplan.terrain.steepness import remarks_on_steepness, slopes_of_soil, steepest_of
 from wlplan.terrain.volume import noise_intensity, volume_deviation
 
 # Rise over the ground that counts as pile [m], as for the toe.
@@ -28,8 +29,6 @@ _RISE = 0.15
 _SKIRT = 0.5
 # Ground that is so much higher than the floor is something that stands [m].
 _STANDING = 0.1
-# Distance over which slopes are taken [m]: longer than the noise of a cell.
-_SLOPE_OVER = 1.0
 
 
 def info(
@@ -75,11 +74,8 @@ def info(
         )
         for cells in footprints
     ]
-    from scipy import ndimage
-
-    free = (above > _RISE) & ~ndimage.binary_dilation(stands, iterations=_reach(grid.cell_size))
-    slopes = _slopes(height, grid.cell_size)[free]
-    steepest = float(np.quantile(slopes, 0.99)) if slopes.size else 0.0
+    slopes = slopes_of_soil(height, ground, stands, grid.cell_size)
+    steepest = steepest_of(slopes)
     middle = float(np.median(slopes)) if slopes.size else 0.0
     first = grid.origin.astype(float)
     last = first + grid.cell_size * (np.array(grid.height.shape) - 1.0)
@@ -91,7 +87,7 @@ def info(
         "floor": sum(one.floor for one in deviations),
     }
     volume = sum(volumes)
-    notes = [*survey.notes, *_steep(steepest, soil)]
+    notes = [*survey.notes, *remarks_on_steepness(steepest, soil)]
     return {
         "volume": volume,
         "volume_deviation": math.hypot(*parts_of.values()),
@@ -167,29 +163,3 @@ def _outline_length(cells: Bool[np.ndarray, "nx ny"]) -> float:
     padded = np.pad(cells, 1).astype(float)
     dx, dy = np.gradient(padded)
     return float(np.hypot(dx, dy).sum())
-
-
-def _steep(steepest: float, soil: Soil) -> list[str]:
-    repose = math.degrees(soil.repose_angle)
-    if steepest <= repose + 3.0:
-        return []
-    return [
-        f"the pile stands at up to {steepest:.0f} degrees, the soil rests at {repose:.0f}: such "
-        f"faces slide when they are dug, or choose a --soil that stands as steep"
-    ]
-
-
-def _reach(cell: float) -> int:
-    """Cells from a place to either end of what its slope is taken over."""
-    return max(1, round(0.5 * _SLOPE_OVER / cell))
-
-
-def _slopes(height: Float[np.ndarray, "nx ny"], cell: float) -> Float[np.ndarray, "nx ny"]:
-    """Slope of the surface over a metre [degrees]."""
-    half = _reach(cell)
-    padded = np.pad(height, half, mode="edge")
-    nx, ny = height.shape
-    x = padded[2 * half :, half : half + ny] - padded[:nx, half : half + ny]
-    y = padded[half : half + nx, 2 * half :] - padded[half : half + nx, :ny]
-    slopes: np.ndarray = np.degrees(np.arctan(np.hypot(x, y) / (2.0 * half * cell)))
-    return slopes

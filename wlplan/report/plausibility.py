@@ -11,6 +11,7 @@ from wlplan.planning.placement import truck_stands_on
 from wlplan.site.frame import Frame
 from wlplan.site.site import Site
 from wlplan.terrain.standing import CLEARED, standing
+from wlplan.terrain.steepness import remarks_on_steepness, slopes_of_soil, steepest_of
 from wlplan.types import Pile
 
 # Part of the median load below which a load yields next to nothing.
@@ -38,6 +39,7 @@ def remarks_on(document: Mapping[str, Any], pile: Pile, site: Site) -> list[str]
         *_tight(loads),
         *_unseen_ways(loads),
         *_truck(pile, site, site.frame),
+        *_steep(pile, site),
     ]
 
 
@@ -104,6 +106,13 @@ def _truck(pile: Pile, site: Site, frame: Frame) -> list[str]:
     if unseen[0] > _UNSEEN_TRUCK:
         return [f"the truck that is loaded from {where} stands where the scan saw nothing"]
     return []
+
+
+def _steep(pile: Pile, site: Site) -> list[str]:
+    floor = np.asarray(pile.floor)
+    stands = standing(floor, pile.cell_size)
+    slopes = slopes_of_soil(np.asarray(pile.height), floor, stands, pile.cell_size)
+    return remarks_on_steepness(steepest_of(slopes), site.soil)
 
 
 def _loads(rows: np.ndarray, one: str = "yields", more: str = "yield") -> str:

@@ -74,7 +74,8 @@ def soil_named(name_or_path: str | os.PathLike[str]) -> Soil:
         name_or_path: A name of `SOILS`, or the path of a file whose keys are fields of `Soil`: SI
             units, and angles in degrees as `friction_deg` and `steel_friction_deg`. `preset`
             names the soil that fields left out come from, by default gravel. A preset goes before
-            a file of the same name: write `./sand` for that.
+            a file of the same name: write `./sand` for that. `NAME@DEGREES` is that soil with
+            another angle of repose, and so of internal friction.
 
     Returns:
         The soil, in SI units and radians.
@@ -83,7 +84,16 @@ def soil_named(name_or_path: str | os.PathLike[str]) -> Soil:
         InputError: If there is no such preset or file, the file cannot be read, or a field is
             unknown, no finite number or outside its range. One line that names the field.
     """
-    return _named(_SOIL, name_or_path)
+    name, at, degrees = os.fspath(name_or_path).rpartition("@")
+    if not at or os.path.exists(name_or_path):
+        return _named(_SOIL, name_or_path)
+    try:
+        repose = math.radians(float(degrees))
+    except ValueError:
+        raise InputError(
+            f"{_short(degrees)} is no angle of repose: give degrees, such as {name}@40."
+        ) from None
+    return soil_recorded({**dataclasses.asdict(_named(_SOIL, name)), "friction": repose})
 
 
 def machine_named(name_or_path: str | os.PathLike[str]) -> WheelLoader:
