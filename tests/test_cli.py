@@ -516,6 +516,17 @@ def test_the_high_world_takes_both_of_its_models(
     assert not {"model", "pile_state"} & set(strict_json(out))
 
 
+@pytest.mark.parametrize("command", ["plan", "diggability", "gradcheck"])
+def test_a_scan_cropped_to_the_pile_is_refused_in_one_line(
+    run: Run, tmp_path: Path, command: str
+) -> None:
+    """No bucket can start on a toe that lies outside the map."""
+    x, y = np.meshgrid(*(0.1 * np.arange(100) - 5.0,) * 2, indexing="ij")
+    pile = Pile((4.0 - 0.6 * np.hypot(x, y)).astype(np.float32), 0.1, (-5.0, -5.0))
+    io.write_pile(tmp_path / "a.npz", pile)
+    refused(run(command, tmp_path / "a.npz"), "start nowhere on the toe", "wider area")
+
+
 # --- soil and machine
 
 

@@ -186,7 +186,7 @@ def pile_named(file: PileFile, machine: WheelLoader) -> NamedPile:
         InputError: If it cannot be read or dug.
     """
     from wlplan.io import read_scan
-    from wlplan.terrain.toe import toe_contour
+    from wlplan.terrain.toe import check_accessible, toe_contour
 
     name, path = file.name, _path_of(file)
     scan = read_scan(path, **file.reading)
@@ -194,6 +194,7 @@ def pile_named(file: PileFile, machine: WheelLoader) -> NamedPile:
         remark(note)
     pile = scan.pile
     contour = toe_contour(pile, machine=machine)
+    check_accessible(contour.accessible)
     fields = {
         "file": f"{BUNDLED} ({path.name})" if name == BUNDLED else name,
         "sha256": _checksum(path),

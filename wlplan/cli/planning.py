@@ -138,6 +138,7 @@ def plan(
         site=place,
         predicted=planned.rollout.performance,
         predicted_cost=float(planned.cost),
+        seen=getattr(world, "faces_seen", None),
         pile=named.fields,
         **site.fields(),
         world=world_name,

@@ -18,7 +18,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from wlplan.models.performance import PerformanceModel
-from wlplan.types import LocalHeightmap, Performance
+from wlplan.types import Characteristics, LocalHeightmap, Performance
 
 PERCENT_90 = 1.6449
 """Standard deviations on either side that hold 90 % of a normal distribution."""
@@ -43,6 +43,11 @@ class Ensemble(struct.PyTreeNode):
     def view_variable(self) -> str:
         """Name of the variable of a data set that holds the views."""
         return self.members.view_variable
+
+    @property
+    def faces_seen(self) -> tuple[Characteristics, Characteristics]:
+        """The least and the largest characteristics of the training data, shared by all members."""
+        return self.members.faces_seen
 
     def __call__(self, local: LocalHeightmap, action: Float[Array, "4"]) -> Performance:
         """Mean of the performance that the members predict.

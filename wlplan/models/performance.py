@@ -7,6 +7,7 @@ local heightmap has 36 × 36 cells; the action is `wlplan.types.action_vector` o
 from __future__ import annotations
 
 import abc
+import dataclasses
 from typing import Any, ClassVar, no_type_check
 
 import jax
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float
 
 from wlplan.models.layers import StandardisedMlp
 from wlplan.models.normaliser import Normaliser
-from wlplan.types import LocalHeightmap, Performance
+from wlplan.types import Characteristics, LocalHeightmap, Performance
 
 INPUTS = 8
 """What is known besides the map: the four characteristics, then the four parameters of the action.
@@ -62,6 +63,14 @@ class PerformanceModel(struct.PyTreeNode, abc.ABC):
             InputError: If the map has another number of cells, or cells of another size.
         """
         return self.of_view(self.view(local), action)
+
+    @property
+    def faces_seen(self) -> tuple[Characteristics, Characteristics]:
+        """The least and the largest characteristics of the training data."""
+        count = len(dataclasses.fields(Characteristics))
+        ends = self.inputs.low, self.inputs.low + self.inputs.span
+        low, high = (Characteristics(*(float(value) for value in end[:count])) for end in ends)
+        return low, high
 
     @abc.abstractmethod
     def view(self, local: LocalHeightmap) -> Array:

@@ -23,9 +23,12 @@ from wlplan.planning.way import Way, room_of, unseen_along
 from wlplan.planning.yard import Yard, packed_soil, yard_of
 from wlplan.site.frame import LOCAL
 from wlplan.site.site import Site
+from wlplan.terrain.characteristics import characteristics
+from wlplan.terrain.heightmap import sample_local
 from wlplan.terrain.toe import ToeContour, toe_contour
 from wlplan.types import (
     Action,
+    Characteristics,
     LoadingPlan,
     Performance,
     Pile,
@@ -119,6 +122,7 @@ class PlanResult(struct.PyTreeNode):
     terms: dict[str, Float[Array, " n"]]  # of the objective, by name, without their weights
     costs: Float[Array, " n"]  # of the loadings
     cost: Float[Array, ""]  # their sum
+    faces: Characteristics | None = None  # dug, leaves (N,); None: nobody asked for them
     ways: Ways | None = None  # leaves (N, ...); None: nobody asked for them
     solves: SolveReport | None = None  # leaves (N,); None: the world does not say
     refereed: PlanResult | None = None  # the same plan played by the referee, if there was one
@@ -147,6 +151,7 @@ class Assessed(struct.PyTreeNode):
     transport: Transport
     terms: dict[str, Array]
     cost: Array
+    face: Characteristics
     ways: Ways
 
 
@@ -167,8 +172,9 @@ def assess(job: Job, pile: Pile, pose: Pose, action: Action, performance: Perfor
     ways = Ways(
         way, unseen_along(way, job.yard, job.site.machine.turning_radius), packed_soil(pile)
     )
+    face = characteristics(sample_local(pile, pose))
     plan = LoadingPlan(pose, action)
-    return Assessed(plan, performance, carried, terms, job.objective.cost(terms), ways)
+    return Assessed(plan, performance, carried, terms, job.objective.cost(terms), face, ways)
 
 
 def assemble(loadings: Assessed, pile: Pile, solves: SolveReport | None = None) -> PlanResult:
@@ -180,6 +186,7 @@ def assemble(loadings: Assessed, pile: Pile, solves: SolveReport | None = None) 
         terms=loadings.terms,
         costs=loadings.cost,
         cost=loadings.cost.sum(),
+        faces=loadings.face,
         ways=loadings.ways,
         solves=solves,
     )

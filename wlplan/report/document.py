@@ -22,7 +22,7 @@ from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
 from wlplan.site.soil import Soil
 from wlplan.terrain.standing import standing
-from wlplan.types import Performance, Pile, SolveReport
+from wlplan.types import Characteristics, Performance, Pile, SolveReport
 
 RECEIVER_FIELDS = tuple(field.name for field in dataclasses.fields(Receiver))
 """Fields of a receiver in plan.json: x [m], y [m] and heading [rad]."""
@@ -40,6 +40,7 @@ def plan_document(
     site: Site,
     predicted: Performance | None = None,
     predicted_cost: float | None = None,
+    seen: tuple[Characteristics, Characteristics] | None = None,
     **origin: Any,
 ) -> dict[str, Any]:
     """Lays a played plan out as the content of a plan.json, with its sums and its ledger.
@@ -50,6 +51,7 @@ def plan_document(
         site: Where: its receiver, its frame, and its soil, whose density closes the ledger.
         predicted: What the world that planned foresaw, leaves [N]; None: nothing is known of it.
         predicted_cost: Cost of the plan in that world.
+        seen: The least and the largest characteristics of faces that it was trained on.
         **origin: Further top-level fields: pile, soil, machine, world, planner, objective, seed.
     """
     total = {
@@ -76,7 +78,8 @@ def plan_document(
         total=total,
         ledger=ledger_of(before, simulated, site.soil),
     )
-    return {**document, "notes": remarks_on(document, before, site)}
+    notes = remarks_on(document, before, site, faces=simulated.faces, seen=seen)
+    return {**document, "notes": notes}
 
 
 def paths_of(before: Pile, played: PlanResult, site: Site) -> list[dict[str, Any]]:

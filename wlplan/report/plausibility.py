@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from wlplan.planning.placement import truck_stands_on
@@ -12,30 +13,43 @@ from wlplan.site.frame import Frame
 from wlplan.site.site import Site
 from wlplan.terrain.standing import CLEARED, standing
 from wlplan.terrain.steepness import remarks_on_steepness, slopes_of_soil, steepest_of
-from wlplan.types import Pile
+from wlplan.types import Characteristics, Pile
 
 # Part of the median load below which a load yields next to nothing.
 _NEXT_TO_NOTHING = 0.3
 # How far a prediction of a load may be off what was played, relative.
 _FAR_OFF = 0.25
+# How far a characteristic of a face may be outside what a model was trained on, as a part of that.
+_OUTSIDE = 0.1
 # Part of a truck, and of all ways, on unseen ground that is worth saying.
 _UNSEEN_TRUCK, _UNSEEN_WAYS = 0.2, 0.1
 # How deep an outline may be in something that is only that [m]: half a cell and some.
 _TOUCHES = -0.1
 
 
-def remarks_on(document: Mapping[str, Any], pile: Pile, site: Site) -> list[str]:
+def remarks_on(
+    document: Mapping[str, Any],
+    pile: Pile,
+    site: Site,
+    *,
+    faces: Characteristics | None = None,
+    seen: tuple[Characteristics, Characteristics] | None = None,
+) -> list[str]:
     """What is worth knowing of a plan, sentences without their stops.
 
     Args:
         document: Content of its plan.json.
         pile: The pile before the first loading.
         site: With its receiver.
+        faces: Characteristics of the faces that are dug, leaves [N], if they are known.
+        seen: The least and the largest that the model that predicted was trained on, if there is
+            one that says so.
     """
     loads = document["loads"]
     return [
         *_empty(loads),
         *_far_off(loads),
+        *_new_faces(faces, seen),
         *_tight(loads),
         *_unseen_ways(loads),
         *_truck(pile, site, site.frame),
@@ -66,6 +80,23 @@ def _far_off(loads: Sequence[Mapping[str, Any]]) -> list[str]:
     return [
         f"{_loads(far, 'is', 'are')} predicted up to {100.0 * worst.max():.0f} % off what was "
         f"played: go by what was played"
+    ]
+
+
+def _new_faces(
+    faces: Characteristics | None, seen: tuple[Characteristics, Characteristics] | None
+) -> list[str]:
+    if faces is None or seen is None:
+        return []
+    at, low, high = (np.stack(jax.tree.leaves(one)) for one in (faces, *seen))
+    low, high = low[:, None], high[:, None]
+    outside = np.maximum(low - at, at - high) / (high - low)
+    new = np.flatnonzero(outside.max(axis=0) > _OUTSIDE)
+    if not len(new):
+        return []
+    return [
+        f"the face of {_loads(new, 'is', 'are')} of a shape that the model was not trained on: "
+        f"go by what was played"
     ]
 
 

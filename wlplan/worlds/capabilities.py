@@ -7,6 +7,7 @@ more, where there is more to say:
   asks for it, and refused if that fails.
 * `has_uncertainty`: whether `uncertainty(pile, pose, action)` gives the standard deviation of the
   error of the performance.
+* `faces_seen`: the least and the largest characteristics of the faces that it was trained on.
 * `solve(pile, pose, action)`: as by calling it, with a `SolveReport` besides.
 * `with_derivatives()`: the same world in the form that has derivatives.
 * `play_load(pile, pose, action, note)`: plays one loading outside of any trace and returns pile,

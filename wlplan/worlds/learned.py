@@ -22,7 +22,15 @@ from wlplan.terrain.automaton import (
 )
 from wlplan.terrain.automaton.windows import paste
 from wlplan.terrain.heightmap import sample_local
-from wlplan.types import Action, Performance, Pile, Pose, SolveReport, action_vector
+from wlplan.types import (
+    Action,
+    Characteristics,
+    Performance,
+    Pile,
+    Pose,
+    SolveReport,
+    action_vector,
+)
 from wlplan.worlds.pile_states import Strip, pile_state_of
 
 
@@ -63,6 +71,14 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
         """The same, and how the solvers ended."""
         solved: tuple[Pile, Performance, SolveReport] = _solve(self, pile, pose, action)
         return solved
+
+    @property
+    def faces_seen(self) -> tuple[Characteristics, Characteristics] | None:
+        """Least and largest characteristics that ψ was trained on; None: it does not say."""
+        seen: tuple[Characteristics, Characteristics] | None = getattr(
+            self.performance, "faces_seen", None
+        )
+        return seen
 
     @property
     def has_uncertainty(self) -> bool:
