@@ -93,10 +93,14 @@ def run(preset: str) -> dict[str, Any]:
                 seed=1,
             )
             played = play(simulator, pile, plan.plan, site=site, objective=MEASURED)
-            clear = np.array([path["clearance"] for path in paths_of(pile, played, site)])
+            foreseen, clear = (
+                np.array([path["clearance"] for path in paths_of(pile, result, site)])
+                for result in (plan, played)
+            )
             # A greedy plan for few loads is the beginning of one for many.
             for loads in counts:
-                row = {"pile": name, "loads": loads, "objective": asked}
+                row: dict[str, Any] = {"pile": name, "loads": loads, "objective": asked}
+                row["foreseen_not_clear"] = int((foreseen[:loads] < -TOUCHES).sum())
                 rows.append({**row, **_summary(played, clear, loads)})
                 print(json.dumps(rows[-1]), flush=True)
     return {"rows": rows}

@@ -61,9 +61,9 @@ _ON_ARC, _ON_LINE = 6, 4
 # Metres of way that one metre in the middle of an obstacle is worth: no way around is longer, also
 # where a corner is only grazed.
 _DETOUR = 100.0
-# The lane is looked at in steps of this length, and soil this much higher than can be driven over
-# counts in full [m].
-_LANE_STEP, _LANE_RAMP = 0.4, 0.1
+# The lane is looked at in steps of this length [m]: ridges of a cell or two are left in it. Soil
+# begins to count this much below what can be driven over, and the truck so far away [m].
+_LANE_STEP, _SOIL_RAMP, _TRUCK_RAMP = 0.2, 0.05, 0.1
 # The best few ways are blended over this length [m].
 _BLENDED, _BLEND = 6, 0.1
 
@@ -383,11 +383,12 @@ def lane_touching(
     columns = max(round(machine.bucket_width / _LANE_STEP), 1) + 1
     along = jnp.asarray(first + (last - first) * (np.arange(rows) + 0.5) / rows, dtype)
     # From edge to edge, and a little further.
-    left = (machine.bucket_width + _LANE_RAMP) * np.linspace(-0.5, 0.5, columns)
+    left = (machine.bucket_width + _SOIL_RAMP) * np.linspace(-0.5, 0.5, columns)
     x, y = to_world(pose, *jnp.meshgrid(along, jnp.asarray(left, dtype), indexing="ij"))
-    soil = jnp.clip((sample(pile.height - pile.floor, pile, x, y) - CLEARED) / _LANE_RAMP, 0.0, 1.0)
+    over = sample(pile.height - pile.floor, pile, x, y) - (CLEARED - _SOIL_RAMP)
+    soil = jnp.clip(over / _SOIL_RAMP, 0.0, 1.0)
     goal = receiver.x, receiver.y, receiver.heading
-    truck = jnp.clip(1.0 - _truck_distance(x, y, goal, machine) / _LANE_RAMP, 0.0, 1.0)
+    truck = jnp.clip(1.0 - _truck_distance(x, y, goal, machine) / _TRUCK_RAMP, 0.0, 1.0)
     most = jnp.maximum(jnp.maximum(soil, truck), is_standing(yard, x, y)).max(axis=1)
     return most.sum() * (last - first) / rows
 
