@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from wlplan.planning import dubins
 from wlplan.planning.dubins import WORDS, Curve, curve_between
@@ -52,8 +52,8 @@ _STRAIGHT = (0.0, 2.0, 4.0, 7.0, 11.0, 16.0)
 _ARC = (0.0, 15.0, 30.0, 45.0, 65.0, 90.0, 120.0)
 _TWICE = ((30.0, 60.0, 90.0), (0.0, 4.0), (0.0, 40.0, 80.0, 120.0))
 # The best cusps are shifted, each to so many places, by at most so much [m] and turned by at most
-# so much [rad], in one round after the other.
-_BEST, _SHIFTS = 8, 12
+# so much [rad], in one round after the other. A part of the fans is as large as a round.
+_BEST, _SHIFTS = 9, 12
 _ROUNDS = ((2.0, 0.45), (1.3, 0.3), (0.8, 0.18), (0.45, 0.1), (0.2, 0.05))
 # Places on each arc, and on the line between, where the loader is looked at. As it is a row of
 # discs, they leave no gap on a line of 20 m; on an arc its corners swing out between them.
@@ -153,37 +153,65 @@ def _placed(cusps: _Cusps, start: _Place, goal: _Place) -> _Place:
 def _search(start: _Place, goal: _Place, room: Room, machine: WheelLoader) -> _Cusps:
     """The best cusps, the very best first; without derivatives.
 
-    One loop over rounds of one size: its body is compiled once.
+    One loop over the fans, part by part, and then over the rounds: its body is compiled once.
     """
-    dtype, size = start[0].dtype, _BEST * _SHIFTS
-    fan = _fan(machine.turning_radius)
-    both = _Cusps(
-        jnp.asarray(np.tile(fan, (2, 1)), dtype), jnp.asarray(np.arange(2 * len(fan)) < len(fan))
+    dtype = start[0].dtype
+    tries = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else dtype),
+        _tries(machine.turning_radius),
     )
-    rounds = jnp.asarray(_halton(len(_ROUNDS) * size).reshape(-1, size, 3), dtype)
-    rounds *= jnp.asarray([(far, far, turn) for far, turn in _ROUNDS], dtype)[:, None]
 
-    def costs_of(cusps: _Cusps) -> Array:
-        ways = _ways(_placed(cusps, start, goal), start, goal, room, machine, _depth_near)
-        return ways.length + _DETOUR * ways.touching
-
-    def best_of(cusps: _Cusps, costs: Array) -> tuple[_Cusps, Array]:
-        _, rows = lax.top_k(-costs, _BEST)
-        return jax.tree.map(lambda leaf: leaf[rows], cusps), costs[rows]
-
-    def shift(best: tuple[_Cusps, Array], shifts: Array) -> tuple[tuple[_Cusps, Array], None]:
+    def more(best: tuple[_Cusps, Array], of: _Tries) -> tuple[tuple[_Cusps, Array], None]:
         (local, at_start), costs = best
-        tried = _Cusps(jnp.repeat(local, _SHIFTS, axis=0) + shifts, jnp.repeat(at_start, _SHIFTS))
+        around = jnp.repeat(local, _SHIFTS, axis=0) + of.shift
+        tried = _Cusps(
+            jnp.where(of.is_fan, of.fan, around),
+            jnp.where(of.is_fan, of.at_start, jnp.repeat(at_start, _SHIFTS)),
+        )
+        ways = _ways(_placed(tried, start, goal), start, goal, room, machine, _depth_near)
+        all_costs = jnp.concatenate([costs, ways.length + _DETOUR * ways.touching])
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), best[0], tried)
-        return best_of(both, jnp.concatenate([costs, costs_of(tried)])), None
+        _, rows = lax.top_k(-all_costs, _BEST)
+        return (jax.tree.map(lambda leaf: leaf[rows], both), all_costs[rows]), None
 
-    (cusps, _), _ = lax.scan(shift, best_of(both, costs_of(both)), rounds)
+    none = _Cusps(jnp.zeros((_BEST, 3), dtype), jnp.zeros(_BEST, bool))
+    (cusps, _), _ = lax.scan(more, (none, jnp.full(_BEST, jnp.inf, dtype)), tries)
     return cusps
+
+
+class _Tries(NamedTuple):
+    """The cusps that are tried in each step of the search, of the fans or around the best."""
+
+    is_fan: Bool[ArrayLike, " steps"]
+    fan: Float[ArrayLike, "steps k 3"]
+    at_start: Bool[ArrayLike, "steps k"]
+    shift: Float[ArrayLike, "steps k 3"]
+
+
+@functools.cache
+def _tries(radius: float) -> _Tries:
+    size = _BEST * _SHIFTS
+    fan = np.tile(_fan(radius), (2, 1))
+    assert len(fan) % size == 0, "a part of the fans is as large as a round"
+    parts = len(fan) // size
+    shift = _halton(len(_ROUNDS) * size).reshape(-1, size, 3)
+    shift *= np.array([(far, far, turn) for far, turn in _ROUNDS])[:, None]
+
+    def padded(values: np.ndarray, before: int, after: int) -> np.ndarray:
+        return np.pad(values, [(before, after), *[(0, 0)] * (values.ndim - 1)])
+
+    of_start = (np.arange(len(fan)) < len(fan) // 2).reshape(parts, size)
+    return _Tries(
+        np.arange(parts + len(_ROUNDS)) < parts,
+        padded(fan.reshape(parts, size, 3), 0, len(_ROUNDS)),
+        padded(of_start, 0, len(_ROUNDS)),
+        padded(shift, parts, 0),
+    )
 
 
 @functools.cache
 def _fan(radius: float) -> Float[np.ndarray, "k 3"]:
-    """The cusps that are tried first, in the frame of an end, and the ways back from them [m]."""
+    """The cusps that are tried first, in the frame of an end."""
     straight, arc = np.meshgrid(_STRAIGHT, np.radians(_either_way(_ARC)), indexing="ij")
     first, middle, last = (
         axis.ravel()
