@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from laws import volume
 
+import wlplan
 from wlplan.errors import InputError
 from wlplan.io import read_scan
 from wlplan.site.frame import LOCAL
@@ -18,7 +19,7 @@ from wlplan.terrain.heightmap import add_local_change
 from wlplan.terrain.standing import lower_envelope, standing
 from wlplan.terrain.structures import find_structures
 from wlplan.terrain.toe import toe_contour
-from wlplan.types import Pile, Pose
+from wlplan.types import Action, Pile, Pose
 
 CELL = 0.1
 SLOPE = np.tan(np.radians(32.0))
@@ -295,3 +296,30 @@ def test_ground_is_not_dug() -> None:
     for after in (dug.height, written):
         assert (np.asarray(after)[bare] >= np.asarray(before.height)[bare] - 1e-6).all()
         assert float(jnp.abs(after - before.height).max()) > 0.1
+
+
+@pytest.mark.parametrize("name", ["simulator", "low", pytest.param("high", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("where", ["ahead", "beside", "across"])
+def test_no_world_digs_a_wall_or_takes_soil_through_it(name: str, where: str) -> None:
+    """Soil leans on a wall; a loader digs in front of it, along it, or towards it at an angle."""
+    x, y = np.meshgrid(*(CELL * np.arange(140),) * 2, indexing="ij")
+    from_wall = {"ahead": x - 8.0, "beside": y - 8.8, "across": (x + y - 15.5) / np.sqrt(2.0)}
+    away = from_wall[where]
+    wall, beyond = (away > -0.05) & (away < 0.25), away >= 0.25
+    ground = np.where(wall, 2.5, 0.0).astype(np.float32)
+    soil = np.where(away < 0.0, np.clip((x - 5.5) * SLOPE, 0.0, 2.4), 0.0).astype(np.float32)
+    pile = Pile(np.maximum(soil, ground), CELL, ground=ground)
+    world = wlplan.load_world(name)
+    action = Action(*(jnp.float32(v) for v in (0.4, 2.0, 0.4, 2.0)))
+    for load in range(3):
+        pose = Pose(*(jnp.float32(v) for v in (5.6 + 0.5 * load, 7.0, 0.0)))
+        bare = np.asarray(pile.height) == ground
+        before, (pile, performance) = pile, world(pile, pose, action)
+        height = np.asarray(pile.height)
+        assert (height >= ground - 1e-5).all()
+        # What is bare loses nothing, the wall is as high as it was, and beyond it nothing came.
+        assert (height[bare] >= ground[bare] - 1e-5).all()
+        np.testing.assert_allclose(height[wall], ground[wall], atol=1e-5)
+        assert np.abs(height[beyond]).max() < 1e-5
+        assert float(performance.mass) > 0.5
+        assert float(jnp.abs(pile.height - before.height).max()) > 0.1

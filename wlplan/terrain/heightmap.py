@@ -153,7 +153,7 @@ def add_local_change(
 
     The change is interpolated at the cells of the grid. Losses and gains are scaled, each by a
     factor close to one, so that both move exactly the volume that they move in the local frame;
-    no cell is dug below the floor.
+    no cell is dug below the floor, and nothing changes behind what stands there.
 
     Args:
         height: Surface to change [m].
@@ -172,7 +172,8 @@ def add_local_change(
     near, start = part_around(window, *middle, math.ceil(reach) + 2)
     along, left = to_local(pose, *cell_centres(near))
     # A border of zeros lets the change fade to nothing outside the local map.
-    padded = jnp.pad(change, 1)
+    free = 1.0 if window.ground is None else _within_reach(window, pose, n, displacement)
+    padded = jnp.pad(free * change, 1)
     corner = (-displacement - CELL_SIZE, -(n + 1) / 2 * CELL_SIZE)
     frame = Pile(padded, CELL_SIZE, jnp.asarray(corner, change.dtype))
     inside = (jnp.abs(left) < (n + 1) / 2 * CELL_SIZE) & (
@@ -191,6 +192,29 @@ def add_local_change(
     scale = jnp.where(total > 0.0, gained / jnp.where(total > 0.0, total, 1.0), 0.0)
     missing = lax.stop_gradient(lost - loss.sum()) * window.cell_size**2
     return lax.dynamic_update_slice(height, surface - loss + scale * gain, start), missing
+
+
+def _within_reach(
+    window: Pile, pose: Pose, cells: int, displacement: float
+) -> Float[Array, "cells cells"]:
+    """Cells of a local map that a bucket and its soil can come to: 1, and 0 behind what stands.
+
+    Ahead along the middle, and from there to the sides, as far as nothing stands in between.
+    """
+    points = local_points(pose, cells, displacement, window.height.dtype)
+    ground = lax.stop_gradient(sample(window.floor, window, *points))
+    stands = jnp.zeros((cells, cells), bool)
+    for axis in (0, 1):
+        steps = jnp.abs(jnp.diff(ground, axis=axis)) > _STANDS * CELL_SIZE
+        for before in ((1, 0), (0, 1)):
+            widths = [before if k == axis else (0, 0) for k in (0, 1)]
+            stands = stands | jnp.pad(steps, widths)
+    clear = 1.0 - stands.astype(ground.dtype)
+    middle = cells // 2
+    ahead = jnp.cumprod(clear[:, middle - 1 : middle + 1].min(axis=1))
+    right = jnp.cumprod(clear[:, middle - 1 :: -1], axis=1)[:, ::-1]
+    left = jnp.cumprod(clear[:, middle:], axis=1)
+    return ahead[:, None] * jnp.concatenate([right, left], axis=1)
 
 
 def take(
@@ -230,6 +254,8 @@ def take(
     return jnp.minimum(jnp.where(follows, scale * wanted, available), available)
 
 
+# Ground that rises more steeply than this stands: no soil lies so [1]. 60 degrees.
+_STANDS = math.tan(math.radians(60.0))
 _MOST_STEPS = 4
 # Where nothing is left to take, the scale would grow without bound.
 _LARGEST_SCALE = 1e3
