@@ -3,8 +3,9 @@
     python tests/reference_numbers.py [FILE.npz]
 
 Only what users call: rollouts, plays, gradients, maps, uncertainties, plans and collected cycles of
-a fixed set of inputs. The file was written by version 0.1.0; write it anew only when the numbers
-are meant to change, and say so in CHANGELOG.md.
+a fixed set of inputs. What follows from the way to the receiver (costs, transport, what greedy
+chooses) is of version 0.2.0, all else is as version 0.1.0 wrote it. Write the file anew only when
+the numbers are meant to change, and say so in CHANGELOG.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The same numbers as version 0.1.0, to rounding: see `reference_numbers`.
+"""The same numbers as before, to rounding: see `reference_numbers`.
 
 They are made by a process of its own, with XLA as users have it and not as the tests set it.
 """
