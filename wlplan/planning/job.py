@@ -19,7 +19,7 @@ from wlplan.planning.placement import beside
 from wlplan.planning.poses import Toe, pose_at, toe_of
 from wlplan.planning.rollout import closed_loop
 from wlplan.planning.transport import transport
-from wlplan.planning.way import Way, room_of, unseen_along
+from wlplan.planning.way import Cusps, Way, cusps_to, room_of, unseen_along
 from wlplan.planning.yard import Yard, packed_soil, yard_of
 from wlplan.site.frame import LOCAL
 from wlplan.site.site import Site
@@ -155,7 +155,16 @@ class Assessed(struct.PyTreeNode):
     ways: Ways
 
 
-def assess(job: Job, pile: Pile, pose: Pose, action: Action, performance: Performance) -> Assessed:
+def assess(
+    job: Job,
+    pile: Pile,
+    pose: Pose,
+    action: Action,
+    performance: Performance,
+    *,
+    cusps: Cusps | None = None,
+    thorough: bool = True,
+) -> Assessed:
     """Transport, terms and cost of one loading.
 
     Args:
@@ -164,9 +173,13 @@ def assess(job: Job, pile: Pile, pose: Pose, action: Action, performance: Perfor
         pose: Dig location and heading.
         action: Parameters of the bucket-filling controller.
         performance: What the loading yields.
+        cusps: Of the best ways to the receiver where they are known, see `way_to`.
+        thorough: Whether the best way is wanted, or a good one.
     """
     room = room_of(job.yard, pile)
-    carried, way = transport(pile, pose, performance.mass, job.site, room)
+    carried, way = transport(
+        pile, pose, performance.mass, job.site, room, cusps=cusps, thorough=thorough
+    )
     loading = Loading(pile, pose, action, performance, carried, job.site)
     terms = job.objective.values(loading)
     ways = Ways(
@@ -193,7 +206,7 @@ def assemble(loadings: Assessed, pile: Pile, solves: SolveReport | None = None) 
 
 
 def play_candidate(
-    job: Job, candidate: Decisions | LoadingPlan, *, report: bool = True
+    job: Job, candidate: Decisions | LoadingPlan, *, report: bool = True, thorough: bool = True
 ) -> PlanResult:
     """Plays a plan, leaves with leading axis N.
 
@@ -201,6 +214,7 @@ def play_candidate(
         job: World, pile, site and objective; for decisions the toe too.
         candidate: Decisions, each taken on the pile that the ones before left, or fixed poses.
         report: Whether to look at how the world's solvers ended, where it says so.
+        thorough: Whether the best ways to the receiver are wanted, or good ones.
     """
     solve = getattr(job.world, "solve", None) if report else None
 
@@ -212,7 +226,8 @@ def play_candidate(
     def record(
         pile: Pile, pose: Pose, action: Action, performance: Performance, *solved: SolveReport
     ) -> tuple[Assessed, SolveReport | None]:
-        return assess(job, pile, pose, action, performance), (solved[0] if solved else None)
+        assessed = assess(job, pile, pose, action, performance, thorough=thorough)
+        return assessed, (solved[0] if solved else None)
 
     after, (loadings, solves) = closed_loop(
         job.world if solve is None else solve, job.pile, candidate, decide_one, record
@@ -220,11 +235,28 @@ def play_candidate(
     return assemble(loadings, after, solves)
 
 
-def cost_of_next(job: Job, pile: Pile, decisions: Decisions) -> Float[Array, ""]:
-    """Cost of a single loading on a given pile; what becomes of the pile is not computed."""
+def cost_of_next(
+    job: Job, pile: Pile, decisions: Decisions, cusps: Cusps | None = None
+) -> Float[Array, ""]:
+    """Cost of a single loading on a given pile; what becomes of the pile is not computed.
+
+    Args:
+        job: World, site, objective and toe.
+        pile: The pile before the loading.
+        decisions: Of the loading.
+        cusps: Of the best ways to the receiver where they are known, see `cusps_of_next`.
+    """
     pose, action = decide(job, pile, decisions)
     _, performance = job.world(pile, pose, action)
-    return assess(job, pile, pose, action, performance).cost
+    return assess(job, pile, pose, action, performance, cusps=cusps, thorough=False).cost
+
+
+def cusps_of_next(job: Job, pile: Pile, position: Array, offset: Array) -> Cusps:
+    """Cusps of good ways from where a loading would be, whatever the action."""
+    assert job.toe is not None
+    pose = pose_at(job.toe, pile, position, offset)
+    room, receiver = room_of(job.yard, pile), job.site.placed_receiver
+    return cusps_to(pose, receiver, room, job.site.machine, thorough=False)
 
 
 def contour_length(job: Job) -> Float[Array, ""]:
@@ -247,7 +279,10 @@ outcomes = ParallelMap(play_candidate)
 def _cost_and_gradient(
     job: Job, candidate: Decisions | LoadingPlan
 ) -> tuple[Float[Array, ""], Any]:
-    return jax.value_and_grad(lambda plan: play_candidate(job, plan, report=False).cost)(candidate)
+    def cost(plan: Decisions | LoadingPlan) -> Array:
+        return play_candidate(job, plan, report=False, thorough=False).cost
+
+    return jax.value_and_grad(cost)(candidate)
 
 
 costs_and_gradients = ParallelMap(_cost_and_gradient)

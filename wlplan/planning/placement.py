@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from wlplan.errors import InputError
-from wlplan.planning.way import Room, lane_touching, room_of, way_to
+from wlplan.planning.way import Room, lane_touching, open_length, room_of, way_to
 from wlplan.planning.yard import yard_of
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
@@ -24,6 +24,7 @@ from wlplan.terrain.heightmap import sample
 from wlplan.terrain.standing import CLEARED, standing
 from wlplan.terrain.toe import ToeContour, edge_poses, toe_contour
 from wlplan.types import Pile, Pose
+from wlplan.xla import ParallelMap
 
 # Farthest that a receiver may be from the middle of the map [m].
 _FARTHEST = 500.0
@@ -40,8 +41,9 @@ _FURTHER = ((13.0, 6.0, 90.0), (16.0, 4.0, 105.0))
 # What a metre of way through an obstacle, and the part of the truck that stands on something or
 # where the scan saw nothing, are worth in metres of way.
 _TOUCHING, _TRUCK_ON, _TRUCK_UNSEEN = 20.0, 40.0, 2.0
-# Places that are judged at once.
-_BATCH = 32
+# Places that are judged at once, and by one core; and by how much the ways in the open may be
+# longer than they have to be [m].
+_BATCH, _PORTION, _SLACK = 32, 8, 0.5
 
 
 Closed: TypeAlias = Bool[ArrayLike, "nx ny"] | None
@@ -171,44 +173,56 @@ def _best(
     apart = np.hypot(*(places[:, None, :2] - poses[None, :, :2]).transpose(2, 0, 1))
     nearest = poses[np.argsort(apart, axis=1)[:, :_NEAREST]]
     room = room_of(yard_of(pile, machine, closed), pile)
-    # Always as many at once, whatever the pile: they are compiled for once.
-    rows = np.minimum(np.arange(-(-len(places) // _BATCH) * _BATCH), len(places) - 1)
     dtype = pile.height.dtype
-    ways = [
-        np.asarray(
-            _mean_ways(
-                jnp.asarray(places[part], dtype),
-                jnp.asarray(nearest[part], dtype),
-                pile,
-                room,
-                machine,
-            )
-        )
-        for part in rows.reshape(-1, _BATCH)
-    ]
-    cost = np.concatenate(ways)[: len(places)] + _cost_of_truck(places, pile, machine)
-    chosen: np.ndarray = places[int(np.argmin(cost))]
+    at, digs_of = jnp.asarray(places, dtype), jnp.asarray(nearest, dtype)
+    truck = _cost_of_truck(places, pile, machine)
+    # The shortest ways come first: once one is found, most of the others need no look.
+    bound = np.asarray(_mean_lengths(at, digs_of, machine)) + truck
+    order = np.argsort(bound)
+    order = np.concatenate([order, np.repeat(order[-1:], -len(order) % _BATCH)])
+    best, least = 0, np.inf
+    site = Site(machine=machine)
+    for part in order.reshape(-1, _BATCH):
+        if bound[part[0]] - _SLACK > least:
+            break
+        rows = part.reshape(-1, _PORTION)
+        ways = np.asarray(_mean_ways((pile, room, site), (at[rows], digs_of[rows]))).ravel()
+        cost = ways + truck[part]
+        if cost.min() < least:
+            best, least = int(part[cost.argmin()]), float(cost.min())
+    chosen: np.ndarray = places[best]
     return chosen
 
 
 @functools.partial(jax.jit, static_argnames="machine")
-def _mean_ways(
-    places: Float[Array, "n 3"],
-    poses: Float[Array, "n m 3"],
-    pile: Pile,
-    room: Room,
-    machine: WheelLoader,
+def _mean_lengths(
+    places: Float[Array, "n 3"], poses: Float[Array, "n m 3"], machine: WheelLoader
+) -> Float[Array, " n"]:
+    """Length of the ways from poses to receivers in the mean, were nothing in the way [m]."""
+
+    def one(place: Array, at: Array) -> Array:
+        return open_length(Pose(*at), Receiver(*place), machine)
+
+    return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(places, poses).mean(axis=1)
+
+
+def _mean_ways_of(
+    shared: tuple[Pile, Room, Site], some: tuple[Float[Array, "n 3"], Float[Array, "n m 3"]]
 ) -> Float[Array, " n"]:
     """What the ways from poses to receivers cost in the mean [m]."""
+    pile, room, site = shared
+    machine = site.machine
 
     def one(place: Array, at: Array) -> Array:
         pose, receiver = Pose(*at), Receiver(*place)
-        length, touching, _ = way_to(pose, receiver, room, machine)
+        length, touching, _ = way_to(pose, receiver, room, machine, thorough=False)
         lane = lane_touching(pose, receiver, pile, room.yard, machine)
         return length + _TOUCHING * (touching + lane)
 
-    each = jax.vmap(jax.vmap(one, in_axes=(None, 0)))(places, poses)
-    return each.mean(axis=1)
+    return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(*some).mean(axis=1)
+
+
+_mean_ways = ParallelMap(_mean_ways_of)
 
 
 def truck_cells(

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from wlplan.constants import GRAVITY, J_PER_KJ, KG_PER_TONNE
 from wlplan.planning.loading import Transport
-from wlplan.planning.way import Room, Way, lane_touching, way_to
+from wlplan.planning.way import Cusps, Room, Way, lane_touching, way_to
 from wlplan.site.site import Site
 from wlplan.types import Pile, Pose
 
@@ -21,7 +21,14 @@ SHIFT_TIME = 1.0
 
 
 def transport(
-    pile: Pile, pose: Pose, mass: Float[Array, ""], site: Site, room: Room
+    pile: Pile,
+    pose: Pose,
+    mass: Float[Array, ""],
+    site: Site,
+    room: Room,
+    *,
+    cusps: Cusps | None = None,
+    thorough: bool = True,
 ) -> tuple[Transport, Way]:
     """From the end of a loading to the start of the next approach.
 
@@ -31,6 +38,8 @@ def transport(
         mass: Load [tonne].
         site: Machine, and the receiver that the load goes to.
         room: To drive around the pile.
+        cusps: As of `way_to`.
+        thorough: Likewise.
 
     Returns:
         Time, work and what is touched, smooth in pose and receiver; and the way that is driven,
@@ -38,7 +47,7 @@ def transport(
     """
     machine = site.machine
     receiver = site.placed_receiver
-    length, touching, way = way_to(pose, receiver, room, machine)
+    length, touching, way = way_to(pose, receiver, room, machine, cusps=cusps, thorough=thorough)
     lane = lane_touching(pose, receiver, pile, room.yard, machine)
     speed = machine.travel_speed
     # There and back; two changes of direction each way.

@@ -17,14 +17,14 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from wlplan.planning import dubins
 from wlplan.planning.dubins import WORDS, Curve, curve_between
@@ -55,6 +55,7 @@ _TWICE = ((30.0, 60.0, 90.0), (0.0, 4.0), (0.0, 40.0, 80.0, 120.0))
 # so much [rad], in one round after the other. A part of the fans is as large as a round.
 _BEST, _SHIFTS = 9, 12
 _ROUNDS = ((2.0, 0.45), (1.3, 0.3), (0.8, 0.18), (0.45, 0.1), (0.2, 0.05))
+_QUICK = ((0.8, 0.18),)
 # Places on each arc, and on the line between, where the loader is looked at. As it is a row of
 # discs, they leave no gap on a line of 20 m; on an arc its corners swing out between them.
 _ON_ARC, _ON_LINE = 6, 4
@@ -95,7 +96,13 @@ def room_of(yard: Yard, pile: Pile) -> Room:
 
 
 def way_to(
-    pose: Pose, receiver: Receiver, room: Room, machine: WheelLoader
+    pose: Pose,
+    receiver: Receiver,
+    room: Room,
+    machine: WheelLoader,
+    *,
+    cusps: Cusps | None = None,
+    thorough: bool = True,
 ) -> tuple[Float[Array, ""], Float[Array, ""], Way]:
     """The way from a dig pose to a receiver.
 
@@ -104,25 +111,48 @@ def way_to(
         receiver: Where the loader stands when it dumps.
         room: Around the pile as it is.
         machine: What drives.
+        cusps: Of the best ways where they are known, for instance from a pose nearby.
+        thorough: Otherwise: whether the best way is wanted, or a good one in half the time.
 
     Returns:
         Length [m] and what of it touches [m], blended over the best ways so that both are smooth in
         pose and receiver, neither below the best; and the best way.
     """
-    back = machine.approach_distance
-    start = (
-        pose.x - back * jnp.cos(pose.heading),
-        pose.y - back * jnp.sin(pose.heading),
-        pose.heading,
-    )
-    goal = (receiver.x, receiver.y, receiver.heading)
-    cusps = _search(*lax.stop_gradient((start, goal)), room, machine)
-    at = _placed(jax.tree.map(lambda leaf: leaf[:_BLENDED], cusps), start, goal)
-    last = _ways(at, start, goal, room, machine, _depth)
+    if cusps is None:
+        cusps = cusps_to(pose, receiver, room, machine, thorough=thorough)
+    start, goal = _ends(pose, receiver, machine)
+    last = _ways(_placed(cusps, start, goal), start, goal, room, machine, _depth)
     cost = last.length + _DETOUR * last.touching
     weight = jax.nn.softmax(-cost / _BLEND)
     best = jax.tree.map(lambda leaf: leaf[jnp.argmin(cost)], last)
     return (weight * last.length).sum(), (weight * last.touching).sum(), best
+
+
+def cusps_to(
+    pose: Pose, receiver: Receiver, room: Room, machine: WheelLoader, *, thorough: bool = True
+) -> Cusps:
+    """The cusps of the best ways, which is what takes time; without derivatives.
+
+    Arguments as of `way_to`.
+    """
+    search = _searcher(machine, thorough, jax.default_backend() == "cpu")
+    found = search(*_ends(pose, receiver, machine), room)
+    best: Cusps = jax.tree.map(lambda leaf: leaf[:_BLENDED], found)
+    return best
+
+
+def open_length(pose: Pose, receiver: Receiver, machine: WheelLoader) -> Float[Array, ""]:
+    """Length of the way, were nothing in it, to half a metre [m]; arguments as of `way_to`."""
+    start, goal = _ends(pose, receiver, machine)
+    fans, known = _fans(machine.turning_radius, start[0].dtype)
+    return (known + _lengths_on(fans, start, goal, machine.turning_radius)).min()
+
+
+def _ends(pose: Pose, receiver: Receiver, machine: WheelLoader) -> tuple[_Place, _Place]:
+    """Where the loading ended, and where the loader dumps."""
+    back = machine.approach_distance
+    x, y = pose.x - back * jnp.cos(pose.heading), pose.y - back * jnp.sin(pose.heading)
+    return (x, y, pose.heading), (receiver.x, receiver.y, receiver.heading)
 
 
 _Place = tuple[Array, Array, Array]
@@ -135,14 +165,14 @@ _Placed = tuple[Array, Array, Array, Array]
 _DepthOf = Callable[[_Placed, _Place, Room, WheelLoader], Array]
 
 
-class _Cusps(NamedTuple):
-    """Cusps in the frame of one of the ends, so that they move with it."""
+class Cusps(NamedTuple):
+    """Cusps of ways, the best first, in the frame of one of the ends, so that they move with it."""
 
     local: Float[Array, "k 3"]  # x, y, heading
     at_start: Bool[Array, " k"]  # or else at the receiver
 
 
-def _placed(cusps: _Cusps, start: _Place, goal: _Place) -> _Place:
+def _placed(cusps: Cusps, start: _Place, goal: _Place) -> _Place:
     """Cusps in the frame of the pile."""
     x, y, heading = (jnp.where(cusps.at_start, a, b) for a, b in zip(start, goal, strict=True))
     c, s = jnp.cos(heading), jnp.sin(heading)
@@ -150,68 +180,116 @@ def _placed(cusps: _Cusps, start: _Place, goal: _Place) -> _Place:
     return x + c * ahead - s * left, y + s * ahead + c * left, heading + turn
 
 
-def _search(start: _Place, goal: _Place, room: Room, machine: WheelLoader) -> _Cusps:
-    """The best cusps, the very best first; without derivatives.
+@functools.cache
+def _searcher(
+    machine: WheelLoader, thorough: bool, one_by_one: bool
+) -> Callable[[_Place, _Place, Room], Cusps]:
+    """`search(start, goal, room)`: the best cusps, the very best first; without derivatives.
 
-    One loop over the fans, part by part, and then over the rounds: its body is compiled once.
+    Args:
+        machine: What drives.
+        thorough: Whether the best are shifted in all rounds, or only in one.
+        one_by_one: Whether the members of a batch are searched for one after the other: each stops
+            where it may, and a CPU gains nothing from a batch.
     """
-    dtype = start[0].dtype
-    tries = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, bool if leaf.dtype == bool else dtype),
-        _tries(machine.turning_radius),
-    )
+    size, radius = _BEST * _SHIFTS, machine.turning_radius
+    count = 2 * len(_fan(radius)[0])
+    parts = count // size
+    assert parts * size == count, "a part of the fans is as large as a round"
+    scales = _ROUNDS if thorough else _QUICK
+    rounds = _halton(len(scales) * size).reshape(-1, size, 3)
+    rounds *= np.array([(far, far, turn) for far, turn in scales])[:, None]
 
-    def more(best: tuple[_Cusps, Array], of: _Tries) -> tuple[tuple[_Cusps, Array], None]:
-        (local, at_start), costs = best
-        around = jnp.repeat(local, _SHIFTS, axis=0) + of.shift
-        tried = _Cusps(
-            jnp.where(of.is_fan, of.fan, around),
-            jnp.where(of.is_fan, of.at_start, jnp.repeat(at_start, _SHIFTS)),
-        )
-        ways = _ways(_placed(tried, start, goal), start, goal, room, machine, _depth_near)
-        all_costs = jnp.concatenate([costs, ways.length + _DETOUR * ways.touching])
-        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), best[0], tried)
-        _, rows = lax.top_k(-all_costs, _BEST)
-        return (jax.tree.map(lambda leaf: leaf[rows], both), all_costs[rows]), None
+    def search(start: _Place, goal: _Place, room: Room) -> Cusps:
+        dtype = start[0].dtype
+        shifts = jnp.asarray(rounds, dtype)
+        fans, known = _fans(radius, dtype)
+        # Those with the shortest ways come first: once one that is clear is shorter than all that
+        # are left, they need no look.
+        length = known + _lengths_on(fans, start, goal, radius)
+        order = jnp.argsort(length)
+        fans = jax.tree.map(lambda leaf: leaf[order].reshape(parts, size, *leaf.shape[1:]), fans)
+        least = length[order][::size]
 
-    none = _Cusps(jnp.zeros((_BEST, 3), dtype), jnp.zeros(_BEST, bool))
-    (cusps, _), _ = lax.scan(more, (none, jnp.full(_BEST, jnp.inf, dtype)), tries)
-    return cusps
+        def of_fan(state: _Search) -> Array:
+            part = jnp.minimum(state.part, parts - 1)
+            return (state.part < parts) & (state.costs[0] > least[part])
+
+        def unfinished(state: _Search) -> Array:
+            return of_fan(state) | (state.round < len(scales))
+
+        def step(state: _Search) -> _Search:
+            more, best = of_fan(state), state.best
+            part = jnp.minimum(state.part, parts - 1)
+            shift = shifts[jnp.minimum(state.round, len(scales) - 1)]
+            around = jnp.repeat(best.local, _SHIFTS, axis=0) + shift
+            tried = Cusps(
+                jnp.where(more, fans.local[part], around),
+                jnp.where(more, fans.at_start[part], jnp.repeat(best.at_start, _SHIFTS)),
+            )
+            ways = _ways(_placed(tried, start, goal), start, goal, room, machine, _depth_near)
+            costs = jnp.concatenate([state.costs, ways.length + _DETOUR * ways.touching])
+            both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), best, tried)
+            _, rows = lax.top_k(-costs, _BEST)
+            one = more.astype(jnp.int32)
+            return _Search(
+                jax.tree.map(lambda leaf: leaf[rows], both),
+                costs[rows],
+                state.part + one,
+                state.round + 1 - one,
+            )
+
+        none = Cusps(jnp.zeros((_BEST, 3), dtype), jnp.zeros(_BEST, bool))
+        zero = jnp.zeros((), jnp.int32)
+        begin = _Search(none, jnp.full(_BEST, jnp.inf, dtype), zero, zero)
+        return lax.while_loop(unfinished, step, begin).best
+
+    if one_by_one:
+        search = jax.custom_batching.sequential_vmap(search)
+
+    @jax.custom_jvp
+    def constant(start: _Place, goal: _Place, room: Room) -> Cusps:
+        return search(start, goal, room)
+
+    @constant.defjvp
+    def _(primals: tuple[_Place, _Place, Room], _: Any) -> tuple[Cusps, Cusps]:
+        found = constant(*primals)
+        none: Any = np.zeros(found.at_start.shape, jax.dtypes.float0)
+        return found, Cusps(jnp.zeros_like(found.local), none)
+
+    return constant
 
 
-class _Tries(NamedTuple):
-    """The cusps that are tried in each step of the search, of the fans or around the best."""
+class _Search(NamedTuple):
+    """The state of a search."""
 
-    is_fan: Bool[ArrayLike, " steps"]
-    fan: Float[ArrayLike, "steps k 3"]
-    at_start: Bool[ArrayLike, "steps k"]
-    shift: Float[ArrayLike, "steps k 3"]
+    best: Cusps
+    costs: Array  # of these, the least first
+    part: Array  # of the fans that comes next
+    round: Array  # that comes next
+
+
+def _fans(radius: float, dtype: Any) -> tuple[Cusps, Array]:
+    """The cusps of both fans, and the lengths of the ways back to the ends they belong to [m]."""
+    fan, lengths = _fan(radius)
+    at_start = jnp.asarray(np.arange(2 * len(fan)) < len(fan))
+    cusps = Cusps(jnp.asarray(np.tile(fan, (2, 1)), dtype), at_start)
+    return cusps, jnp.asarray(np.tile(lengths, 2), dtype)
+
+
+def _lengths_on(fans: Cusps, start: _Place, goal: _Place, radius: float) -> Array:
+    """Lengths of the shortest curves from the cusps of fans to the other ends [m]."""
+    ends = (jnp.where(fans.at_start, b, a)[None] for a, b in zip(start, goal, strict=True))
+    x1, y1, heading1 = ends
+    x0, y0, heading0 = (leaf[None] for leaf in _placed(fans, start, goal))
+    words = jnp.asarray(WORDS, x0.dtype).reshape(len(WORDS), 1, 2)
+    curves, exists = curve_between((x0, y0, heading0), (x1, y1, heading1), words, radius)
+    return jnp.where(exists, dubins.length_of(curves, radius), jnp.inf).min(axis=0)
 
 
 @functools.cache
-def _tries(radius: float) -> _Tries:
-    size = _BEST * _SHIFTS
-    fan = np.tile(_fan(radius), (2, 1))
-    assert len(fan) % size == 0, "a part of the fans is as large as a round"
-    parts = len(fan) // size
-    shift = _halton(len(_ROUNDS) * size).reshape(-1, size, 3)
-    shift *= np.array([(far, far, turn) for far, turn in _ROUNDS])[:, None]
-
-    def padded(values: np.ndarray, before: int, after: int) -> np.ndarray:
-        return np.pad(values, [(before, after), *[(0, 0)] * (values.ndim - 1)])
-
-    of_start = (np.arange(len(fan)) < len(fan) // 2).reshape(parts, size)
-    return _Tries(
-        np.arange(parts + len(_ROUNDS)) < parts,
-        padded(fan.reshape(parts, size, 3), 0, len(_ROUNDS)),
-        padded(of_start, 0, len(_ROUNDS)),
-        padded(shift, parts, 0),
-    )
-
-
-@functools.cache
-def _fan(radius: float) -> Float[np.ndarray, "k 3"]:
-    """The cusps that are tried first, in the frame of an end."""
+def _fan(radius: float) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
+    """The cusps that are tried first, in the frame of an end, and the ways from there to it [m]."""
     straight, arc = np.meshgrid(_STRAIGHT, np.radians(_either_way(_ARC)), indexing="ij")
     first, middle, last = (
         axis.ravel()
@@ -227,7 +305,8 @@ def _fan(radius: float) -> Float[np.ndarray, "k 3"]:
     first = np.concatenate([np.zeros(arc.size), first])
     none = np.zeros(first.size)
     turned = _reverse((none, none, none), none, first, radius)
-    return np.stack(_reverse(turned, straight, last, radius), axis=-1)
+    cusps = np.stack(_reverse(turned, straight, last, radius), axis=-1)
+    return cusps, straight + radius * (np.abs(first) + np.abs(last))
 
 
 def _either_way(angles: tuple[float, ...]) -> list[float]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from wlplan.actions import spread_actions
 from wlplan.planning.descent import descend
@@ -19,10 +20,12 @@ from wlplan.planning.job import (
     can_refine,
     contour_length,
     cost_of_next,
+    cusps_of_next,
     decide,
     stacked,
 )
 from wlplan.planning.proposals import Progress, Proposals
+from wlplan.planning.way import Cusps
 from wlplan.types import Pile
 from wlplan.xla import ParallelMap
 
@@ -65,7 +68,9 @@ class Greedy:
             poses = np.stack(np.meshgrid(positions, self.offsets, indexing="ij"), -1)
             poses = poses.reshape(-1, 2).astype(dtype)
             actions = spread_actions(self.actions, random, dtype)
-            costs = _candidate_costs(job, pile, poses, actions, batch=self.batch)
+            cusps = _cusps_at(job, pile, positions.astype(dtype), batch=self.batch // self.actions)
+            cusps = jax.tree.map(lambda leaf: np.repeat(leaf, len(self.offsets), axis=0), cusps)
+            costs = _candidate_costs(job, pile, (poses, cusps), actions, batch=self.batch)
             # One start a pose, so that refinement does not begin in the same place eight times.
             cheapest = costs.min(axis=1)
             best_poses = np.argsort(cheapest)[: self.refined]
@@ -76,8 +81,9 @@ class Greedy:
             )
             values = cheapest[best_poses]
             if refines:
+                best_cusps = jax.tree.map(lambda leaf, rows=best_poses: leaf[rows], cusps)
                 starts, refined = _refine(
-                    job, pile, starts, steps=self.refine_steps, rate=self.refine_rate
+                    job, pile, starts, best_cusps, steps=self.refine_steps, rate=self.refine_rate
                 )
                 values = np.asarray(refined)
             best = int(np.argmin(values))
@@ -89,56 +95,85 @@ class Greedy:
         return Proposals(jax.tree.map(lambda leaf: leaf[None], stacked(chosen)))
 
 
+_Tried = tuple[Any, Cusps]
+"""Poses [p, 2], as positions along the toe and heading offsets, and cusps of the ways."""
+
+
 def _costs_at_poses(
-    shared: tuple[Job, Pile, Float[Array, "a 4"]], poses: Float[Array, "p 2"]
+    shared: tuple[Job, Pile, Float[Array, "a 4"]], tried: _Tried
 ) -> Float[Array, "p a"]:
     """Cost of every action at every pose; what depends on the pose alone is computed once."""
     job, pile, actions = shared
 
-    def at_pose(pose: Array) -> Array:
-        return jax.vmap(lambda a: cost_of_next(job, pile, Decisions(pose[0], pose[1], a)))(actions)
+    def at_pose(pose: Array, cusps: Cusps) -> Array:
+        return jax.vmap(
+            lambda action: cost_of_next(job, pile, Decisions(pose[0], pose[1], action), cusps)
+        )(actions)
 
-    return jax.vmap(at_pose)(poses)
+    return jax.vmap(at_pose)(*tried)
 
 
-_costs_of_portions = ParallelMap(_costs_at_poses)
+def _cusps_of_some(shared: tuple[Job, Pile], positions: Float[Array, " p"]) -> Cusps:
+    job, pile = shared
+    return jax.vmap(lambda at: cusps_of_next(job, pile, at, jnp.zeros_like(at)))(positions)
+
+
+_costs_of_portions, _cusps_of_portions = ParallelMap(_costs_at_poses), ParallelMap(_cusps_of_some)
+
+
+def _portions(count: int, size: int) -> Int[np.ndarray, "portions size"]:
+    """Rows in portions of one shape; the last row fills the last portion up.
+
+    The number of poses follows from the length of the toe; if that were a shape, every next pile
+    would be compiled for.
+    """
+    portions = -(-count // size)
+    rows: np.ndarray = np.minimum(np.arange(portions * size), count - 1).reshape(portions, size)
+    return rows
+
+
+def _cusps_at(job: Job, pile: Pile, positions: Float[np.ndarray, " p"], *, batch: int) -> Cusps:
+    """Cusps of the ways from positions along the toe, square to it."""
+    rows = _portions(len(positions), max(1, batch))
+    found = _cusps_of_portions((job, pile), positions[rows])
+    joined: Cusps = jax.tree.map(
+        lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:])[: len(positions)], found
+    )
+    return joined
 
 
 def _candidate_costs(
-    job: Job,
-    pile: Pile,
-    poses: Float[np.ndarray, "p 2"],
-    actions: Float[Array, "a 4"],
-    *,
-    batch: int,
+    job: Job, pile: Pile, tried: _Tried, actions: Float[Array, "a 4"], *, batch: int
 ) -> Float[np.ndarray, "p a"]:
-    """Cost of every action at every pose, infinite where it is none, in portions of one shape.
+    """Cost of every action at every pose, infinite where it is none.
 
-    Portions hold at most `batch` costs. Poses are positions along the toe and heading offsets, as
-    in `Decisions`. Their number follows from the length of the toe; if that were a shape, every
-    next pile would be compiled for.
+    Portions hold at most `batch` costs.
     """
-    size = max(1, batch // len(actions))
-    portions = -(-len(poses) // size)
-    rows = np.minimum(np.arange(portions * size), len(poses) - 1).reshape(portions, size)
-    found = np.asarray(_costs_of_portions((job, pile, actions), poses[rows]))
+    count = len(tried[0])
+    rows = _portions(count, max(1, batch // len(actions)))
+    parts = jax.tree.map(lambda leaf: leaf[rows], tried)
+    found = np.asarray(_costs_of_portions((job, pile, actions), parts))
     costs: np.ndarray = np.nan_to_num(found, nan=np.inf, posinf=np.inf)
-    return costs.reshape(-1, len(actions))[: len(poses)]
+    return costs.reshape(-1, len(actions))[:count]
 
 
 @functools.partial(jax.jit, static_argnames=("steps", "rate"))
 def _refine(
-    job: Job, pile: Pile, starts: Decisions, *, steps: int, rate: float
+    job: Job, pile: Pile, starts: Decisions, cusps: Cusps, *, steps: int, rate: float
 ) -> tuple[Decisions, Float[Array, " k"]]:
-    """Adam on single loadings, from several starts; returns the best visited of each."""
+    """Adam on single loadings, from several starts; returns the best visited of each.
+
+    The ways keep their cusps, which move with the pose.
+    """
     length = contour_length(job)
 
-    def cost(variables: Decisions) -> Array:
+    def cost(variables: Decisions, cusps: Cusps) -> Array:
         # Metres along the contour, so that one rate suits all variables.
-        return cost_of_next(job, pile, variables.replace(position=variables.position / length))
+        decisions = variables.replace(position=variables.position / length)
+        return cost_of_next(job, pile, decisions, cusps)
 
     best, costs = descend(
-        jax.vmap(jax.value_and_grad(cost)),
+        lambda variables: jax.vmap(jax.value_and_grad(cost))(variables, cusps),
         starts.replace(position=starts.position * length),
         optax.adam(optax.cosine_decay_schedule(rate, steps)),
         steps,
