@@ -87,7 +87,7 @@ def info(
         "floor": sum(one.floor for one in deviations),
     }
     volume = sum(volumes)
-    notes = [*survey.notes, *remarks_on_steepness(steepest, soil)]
+    notes = [*survey.notes, *remarks_on_steepness(slopes, soil)]
     return {
         "volume": volume,
         "volume_deviation": math.hypot(*parts_of.values()),

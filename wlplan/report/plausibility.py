@@ -12,7 +12,7 @@ from wlplan.planning.placement import truck_stands_on
 from wlplan.site.frame import Frame
 from wlplan.site.site import Site
 from wlplan.terrain.standing import CLEARED, standing
-from wlplan.terrain.steepness import remarks_on_steepness, slopes_of_soil, steepest_of
+from wlplan.terrain.steepness import remarks_on_steepness, slopes_of_soil
 from wlplan.types import Characteristics, Pile
 
 # Part of the median load below which a load yields next to nothing.
@@ -143,7 +143,7 @@ def _steep(pile: Pile, site: Site) -> list[str]:
     floor = np.asarray(pile.floor)
     stands = standing(floor, pile.cell_size)
     slopes = slopes_of_soil(np.asarray(pile.height), floor, stands, pile.cell_size)
-    return remarks_on_steepness(steepest_of(slopes), site.soil)
+    return remarks_on_steepness(slopes, site.soil)
 
 
 def _loads(rows: np.ndarray, one: str = "yields", more: str = "yield") -> str:
