@@ -41,6 +41,8 @@ class Greedy:
     poses_per_metre: float = 1.5
     offsets: tuple[float, ...] = (-0.6, 0.0, 0.6)
     actions: int = 24
+    # So many poses in a row have the ways of the first of them, shifted with the pose.
+    neighbours: int = 2
     # Candidates that are refined, each at a pose of its own, and steps and rate of Adam.
     refined: int = 8
     refine_steps: int = 30
@@ -68,8 +70,10 @@ class Greedy:
             poses = np.stack(np.meshgrid(positions, self.offsets, indexing="ij"), -1)
             poses = poses.reshape(-1, 2).astype(dtype)
             actions = spread_actions(self.actions, random, dtype)
-            cusps = _cusps_at(job, pile, positions.astype(dtype), batch=self.batch // self.actions)
-            cusps = jax.tree.map(lambda leaf: np.repeat(leaf, len(self.offsets), axis=0), cusps)
+            searched = positions[:: self.neighbours].astype(dtype)
+            cusps = _cusps_at(job, pile, searched, batch=self.batch // self.actions)
+            of_pose = np.arange(len(poses)) // (self.neighbours * len(self.offsets))
+            cusps = jax.tree.map(lambda leaf, rows=of_pose: leaf[rows], cusps)
             costs = _candidate_costs(job, pile, (poses, cusps), actions, batch=self.batch)
             # One start a pose, so that refinement does not begin in the same place eight times.
             cheapest = costs.min(axis=1)
