@@ -77,11 +77,14 @@ def numbers_of(name: str) -> dict[str, Any]:
 
 
 def greedy_numbers() -> dict[str, Any]:
-    """A greedy plan of two loads on a cone in the low world."""
+    """What a greedy plan of two loads on a cone costs in the low world; not its digs.
+
+    Of poses that are worth the same, rounding picks one.
+    """
     pile = wlplan.relax(wlplan.seed_pile("conical", slope=math.radians(30.0), seed=1))
     world = wlplan.load_world("low")
     result = wlplan.plan_loads(world, pile, loads=2, planner="greedy", seed=3)
-    return {"relaxed": pile.height[::4, ::4], "plan": result.plan, "cost": result.cost}
+    return {"relaxed": pile.height[::4, ::4], "cost": result.cost}
 
 
 def cycle_numbers() -> dict[str, Any]:

@@ -17,6 +17,8 @@ pytestmark = pytest.mark.slow
 # Rounding of float32 over ten loads; another processor, or another order of operations, does that
 # much. A change of the method does far more.
 RELATIVE = 2e-4
+# Where the way to the receiver counts: its search may end at another of ways almost as short.
+RELATIVE_OF_WAYS = 0.01
 
 
 @pytest.fixture(scope="module")
@@ -36,4 +38,6 @@ def test_the_numbers_are_the_same(found: dict[str, np.ndarray], group: str) -> N
     assert {name for name in found if name.split(" ")[0] == group} == set(wanted)
     for name, want in wanted.items():
         scale = max(float(np.abs(want).max()), 1e-6)
-        np.testing.assert_allclose(found[name], want, rtol=0.0, atol=RELATIVE * scale, err_msg=name)
+        of_ways = any(word in name for word in ("cost", "transport"))
+        relative = RELATIVE_OF_WAYS if of_ways else RELATIVE
+        np.testing.assert_allclose(found[name], want, rtol=0.0, atol=relative * scale, err_msg=name)
