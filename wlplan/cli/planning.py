@@ -271,6 +271,7 @@ def simulate(
             progress(engine, count, count, None)
 
     predicted = _predicted_of(given)
+    by: dict[str, Any] = {"engine": engine} if cycles else {}
     document = plan_document(
         pile,
         played,
@@ -281,7 +282,7 @@ def simulate(
         **site.fields(),
         **{name: given[name] for name in _ORIGIN_FIELDS if name in given},
         objective=objective,
-        **({"engine": engine} if cycles else {}),
+        **by,
     )
     for load, cycle in zip(document["loads"], cycles, strict=False):
         load["cycle"] = cycle
