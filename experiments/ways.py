@@ -17,7 +17,8 @@ from experiments._common.exhaustive import Place
 from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.clearance import way_clearance
-from wlplan.planning.way import Room, Way, points_of, room_of, way_to
+from wlplan.planning.driving import Room, Way, room_of
+from wlplan.planning.way import points_of, way_to
 from wlplan.planning.yard import yard_of
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, new_figure, tidy

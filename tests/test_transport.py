@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from wlplan.constants import GRAVITY
+from wlplan.planning.driving import Way, room_of
 from wlplan.planning.loading import Transport
 from wlplan.planning.transport import DUMP_TIME, SHIFT_TIME, transport
-from wlplan.planning.way import Way, room_of
 from wlplan.planning.yard import yard_of
 from wlplan.site.machine import WA320
 from wlplan.site.receiver import Receiver

@@ -9,8 +9,10 @@ import pytest
 from laws import assert_gradient
 
 from wlplan.planning.clearance import FARTHEST, clearance
+from wlplan.planning.driving import Room, Way, room_of
+from wlplan.planning.lane import lane_touching
 from wlplan.planning.placement import best_receiver, place_receiver, truck_stands_on
-from wlplan.planning.way import Room, Way, lane_touching, points_of, room_of, way_to
+from wlplan.planning.way import points_of, way_to
 from wlplan.planning.yard import Yard, packed_soil, unpacked_soil, yard_of
 from wlplan.site.machine import WA320
 from wlplan.site.receiver import Receiver, truck_outline

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from wlplan.planning.way import LANE_END
+from wlplan.planning.lane import LANE_END
 from wlplan.site.machine import WheelLoader
 from wlplan.site.receiver import truck_outline
 from wlplan.types import Pile

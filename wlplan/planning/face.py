@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from wlplan.planning.lane import LANE_END
 from wlplan.planning.loading import Loading
-from wlplan.planning.way import LANE_END
 from wlplan.terrain.characteristics import characteristics
 from wlplan.terrain.heightmap import sample, sample_local, to_world
 from wlplan.terrain.standing import CLEARED

@@ -13,13 +13,15 @@ from jaxtyping import Array, Float, UInt8
 from wlplan.actions import squash
 from wlplan.checks import check_pile, check_world
 from wlplan.errors import InputError
+from wlplan.planning.driving import Way, room_of
 from wlplan.planning.loading import Loading, Transport
 from wlplan.planning.objective import Objective, objective_of
 from wlplan.planning.placement import beside
 from wlplan.planning.poses import Toe, pose_at, toe_of
 from wlplan.planning.rollout import closed_loop
+from wlplan.planning.search import Cusps
 from wlplan.planning.transport import transport
-from wlplan.planning.way import Cusps, Way, cusps_to, room_of, unseen_along
+from wlplan.planning.way import cusps_to, unseen_along
 from wlplan.planning.yard import Yard, packed_soil, yard_of
 from wlplan.site.frame import LOCAL
 from wlplan.site.site import Site

@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from wlplan.errors import InputError
-from wlplan.planning.way import Room, lane_touching, open_length, room_of, way_to
+from wlplan.planning.driving import Room, room_of
+from wlplan.planning.lane import lane_touching
+from wlplan.planning.way import open_length, way_to
 from wlplan.planning.yard import yard_of
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader

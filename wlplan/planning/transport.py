@@ -9,8 +9,11 @@ from __future__ import annotations
 from jaxtyping import Array, Float
 
 from wlplan.constants import GRAVITY, J_PER_KJ, KG_PER_TONNE
+from wlplan.planning.driving import Room, Way
+from wlplan.planning.lane import lane_touching
 from wlplan.planning.loading import Transport
-from wlplan.planning.way import Cusps, Room, Way, lane_touching, way_to
+from wlplan.planning.search import Cusps
+from wlplan.planning.way import way_to
 from wlplan.site.site import Site
 from wlplan.types import Pile, Pose
 

@@ -25,7 +25,7 @@ from wlplan.planning.job import (
     stacked,
 )
 from wlplan.planning.proposals import Progress, Proposals
-from wlplan.planning.way import Cusps
+from wlplan.planning.search import Cusps
 from wlplan.types import Pile
 from wlplan.xla import ParallelMap
 
