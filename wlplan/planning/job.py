@@ -208,7 +208,7 @@ def assemble(loadings: Assessed, pile: Pile, solves: SolveReport | None = None) 
 
 
 def play_candidate(
-    job: Job, candidate: Decisions | LoadingPlan, *, report: bool = True, thorough: bool = True
+    job: Job, candidate: Decisions | LoadingPlan, *, report: bool = True
 ) -> PlanResult:
     """Plays a plan, leaves with leading axis N.
 
@@ -216,7 +216,6 @@ def play_candidate(
         job: World, pile, site and objective; for decisions the toe too.
         candidate: Decisions, each taken on the pile that the ones before left, or fixed poses.
         report: Whether to look at how the world's solvers ended, where it says so.
-        thorough: Whether the best ways to the receiver are wanted, or good ones.
     """
     solve = getattr(job.world, "solve", None) if report else None
 
@@ -228,8 +227,7 @@ def play_candidate(
     def record(
         pile: Pile, pose: Pose, action: Action, performance: Performance, *solved: SolveReport
     ) -> tuple[Assessed, SolveReport | None]:
-        assessed = assess(job, pile, pose, action, performance, thorough=thorough)
-        return assessed, (solved[0] if solved else None)
+        return assess(job, pile, pose, action, performance), (solved[0] if solved else None)
 
     after, (loadings, solves) = closed_loop(
         job.world if solve is None else solve, job.pile, candidate, decide_one, record
@@ -281,10 +279,7 @@ outcomes = ParallelMap(play_candidate)
 def _cost_and_gradient(
     job: Job, candidate: Decisions | LoadingPlan
 ) -> tuple[Float[Array, ""], Any]:
-    def cost(plan: Decisions | LoadingPlan) -> Array:
-        return play_candidate(job, plan, report=False, thorough=False).cost
-
-    return jax.value_and_grad(cost)(candidate)
+    return jax.value_and_grad(lambda plan: play_candidate(job, plan, report=False).cost)(candidate)
 
 
 costs_and_gradients = ParallelMap(_cost_and_gradient)
