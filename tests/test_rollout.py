@@ -15,7 +15,7 @@ from precision import in_float64
 import wlplan
 from wlplan.engines.simulator import Simulator
 from wlplan.planning.job import make_job, play_candidate
-from wlplan.planning.rollout import closed_loop, rollout
+from wlplan.planning.rollout import load_by_load, rollout
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
 from wlplan.site.soil import GRAVEL
@@ -118,7 +118,7 @@ def test_it_passes_float64_and_gradients_in_plan_and_pile() -> None:
         assert_gradient(cost, (plan_of(random_rows(2, 3), jnp.float64), pile.height[:, :]))
 
 
-def test_closed_loop_decides_on_the_pile_as_it_is() -> None:
+def test_loadings_may_be_decided_on_the_pile_as_it_is() -> None:
     """The decision reads the pile; what it then saw is what the loop gives by hand."""
 
     def decide(pile: Pile, threshold: jax.Array) -> tuple[Pose, Action]:
@@ -132,12 +132,12 @@ def test_closed_loop_decides_on_the_pile_as_it_is() -> None:
 
     thresholds = jnp.asarray([0.5, 0.2, 0.1])
 
-    def record(
-        _: Pile, pose: Pose, action: Action, performance: Performance
-    ) -> tuple[LoadingPlan, Performance]:
-        return LoadingPlan(pose, action), performance
+    def load(pile: Pile, threshold: jax.Array) -> tuple[Pile, tuple[LoadingPlan, Performance]]:
+        pose, action = decide(pile, threshold)
+        after, performance = world(pile, pose, action)
+        return after, (LoadingPlan(pose, action), performance)
 
-    after, (plan, performance) = closed_loop(world, heap(), thresholds, decide, record)
+    after, (plan, performance) = load_by_load(load, heap(), thresholds)
     left = np.cumprod([1.0, 0.5, 0.8])
     np.testing.assert_allclose(plan.pose.x, float(volume(heap())) * left, rtol=1e-5)
     np.testing.assert_allclose(plan.pose.y, float(heap().height.max()) * left, rtol=1e-5)

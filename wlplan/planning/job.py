@@ -18,7 +18,7 @@ from wlplan.planning.loading import Loading, Transport
 from wlplan.planning.objective import Objective, objective_of
 from wlplan.planning.placement import beside
 from wlplan.planning.poses import Toe, pose_at, toe_of
-from wlplan.planning.rollout import closed_loop
+from wlplan.planning.rollout import load_by_load
 from wlplan.planning.search import Cusps
 from wlplan.planning.transport import transport
 from wlplan.planning.way import cusps_to, unseen_along
@@ -130,10 +130,12 @@ class PlanResult(struct.PyTreeNode):
     refereed: PlanResult | None = None  # the same plan played by the referee, if there was one
 
 
-def decide(job: Job, pile: Pile, decisions: Decisions) -> tuple[Pose, Action]:
+def decide(job: Job, pile: Pile, one: Decisions | LoadingPlan) -> tuple[Pose, Action]:
     """Pose and action of one loading on the pile as it is."""
+    if isinstance(one, LoadingPlan):
+        return one.pose, one.action
     assert job.toe is not None
-    return pose_at(job.toe, pile, decisions.position, decisions.offset), squash(decisions.action)
+    return pose_at(job.toe, pile, one.position, one.offset), squash(one.action)
 
 
 @no_type_check
@@ -208,30 +210,31 @@ def assemble(loadings: Assessed, pile: Pile, solves: SolveReport | None = None) 
 
 
 def play_candidate(
-    job: Job, candidate: Decisions | LoadingPlan, *, report: bool = True
+    job: Job,
+    candidate: Decisions | LoadingPlan,
+    *,
+    cusps: Cusps | None = None,
+    report: bool = True,
 ) -> PlanResult:
     """Plays a plan, leaves with leading axis N.
 
     Args:
         job: World, pile, site and objective; for decisions the toe too.
         candidate: Decisions, each taken on the pile that the ones before left, or fixed poses.
+        cusps: Of the best ways to the receiver where they are known, see `cusps_of_plans`.
         report: Whether to look at how the world's solvers ended, where it says so.
     """
     solve = getattr(job.world, "solve", None) if report else None
+    play: Callable[..., Any] = job.world if solve is None else solve
 
-    def decide_one(pile: Pile, one: Decisions | LoadingPlan) -> tuple[Pose, Action]:
-        if isinstance(one, Decisions):
-            return decide(job, pile, one)
-        return one.pose, one.action
+    def load(pile: Pile, inputs: Any) -> tuple[Pile, tuple[Assessed, SolveReport | None]]:
+        one, known = inputs
+        pose, action = decide(job, pile, one)
+        after, performance, *solved = play(pile, pose, action)
+        assessed = assess(job, pile, pose, action, performance, cusps=known)
+        return after, (assessed, solved[0] if solved else None)
 
-    def record(
-        pile: Pile, pose: Pose, action: Action, performance: Performance, *solved: SolveReport
-    ) -> tuple[Assessed, SolveReport | None]:
-        return assess(job, pile, pose, action, performance), (solved[0] if solved else None)
-
-    after, (loadings, solves) = closed_loop(
-        job.world if solve is None else solve, job.pile, candidate, decide_one, record
-    )
+    after, (loadings, solves) = load_by_load(load, job.pile, (candidate, cusps))
     return assemble(loadings, after, solves)
 
 
@@ -276,14 +279,34 @@ outcomes = ParallelMap(play_candidate)
 """`outcomes(job, candidates)` plays several plans; leaves [K, N]."""
 
 
+def _cusps_of_plan(job: Job, candidate: Decisions | LoadingPlan) -> Cusps:
+    def load(pile: Pile, one: Decisions | LoadingPlan) -> tuple[Pile, Cusps]:
+        pose, action = decide(job, pile, one)
+        room, receiver = room_of(job.yard, pile), job.site.placed_receiver
+        return job.world(pile, pose, action)[0], cusps_to(pose, receiver, room, job.site.machine)
+
+    found: Cusps = load_by_load(load, job.pile, candidate)[1]
+    return found
+
+
+cusps_of_plans = ParallelMap(_cusps_of_plan)
+"""`cusps_of_plans(job, candidates)`: cusps of the best ways to the receiver; leaves [K, N, ...]."""
+
+
 def _cost_and_gradient(
-    job: Job, candidate: Decisions | LoadingPlan
+    job: Job, candidate: tuple[Decisions | LoadingPlan, Cusps]
 ) -> tuple[Float[Array, ""], Any]:
-    return jax.value_and_grad(lambda plan: play_candidate(job, plan, report=False).cost)(candidate)
+    plan, cusps = candidate
+
+    def cost(plan: Decisions | LoadingPlan) -> Array:
+        return play_candidate(job, plan, cusps=cusps, report=False).cost
+
+    return jax.value_and_grad(cost)(plan)
 
 
 costs_and_gradients = ParallelMap(_cost_and_gradient)
-"""`costs_and_gradients(job, candidates)`: cost of several plans, leaves [K, N], and gradient."""
+"""`costs_and_gradients(job, (candidates, cusps))`: cost of several plans, leaves [K, N], and
+gradient. The ways keep their cusps, which move with the poses: so a descent is smooth, and fast."""
 
 
 def check_has_gradient(job: Job, remedy: str) -> None:

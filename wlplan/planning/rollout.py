@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 from jax import lax
 
 from wlplan.checks import check_pile, check_plan, check_world
 from wlplan.terrain.excavation import PENETRATION
-from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose, PyTree, Rollout, World
+from wlplan.types import LoadingPlan, Performance, Pile, PyTree, Rollout, World
 from wlplan.worlds.capabilities import as_pytree
 
 
@@ -42,40 +41,25 @@ def rollout(world: World, pile: Pile, plan: LoadingPlan) -> Rollout:
 
 @jax.jit
 def _rollout(world: World, pile: Pile, plan: LoadingPlan) -> Rollout:
-    def decide(_: Pile, loading: LoadingPlan) -> tuple[Pose, Action]:
-        return loading.pose, loading.action
+    def load(pile: Pile, loading: LoadingPlan) -> tuple[Pile, Performance]:
+        return world(pile, loading.pose, loading.action)
 
-    def performance_of(_: Pile, __: Pose, ___: Action, performance: Performance) -> Performance:
-        return performance
-
-    after, performance = closed_loop(world, pile, plan, decide, performance_of)
+    after, performance = load_by_load(load, pile, plan)
     return Rollout(performance=performance, pile=after)
 
 
-def closed_loop(
-    play: Callable[..., tuple[PyTree, ...]],
-    pile: Pile,
-    inputs: PyTree,
-    decide: Callable[[Pile, PyTree], tuple[Pose, Action]],
-    record: Callable[..., PyTree],
-) -> tuple[Pile, PyTree]:
-    """Plays loadings that are decided on the pile as it is by then.
+def load_by_load(
+    load: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], state: PyTree, inputs: PyTree
+) -> tuple[PyTree, PyTree]:
+    """Plays loadings one after the other; reverse mode recomputes each.
 
     Args:
-        play: A world, or its `solve`: `play(pile, pose, action) -> (pile_after, *outcome)`.
-        pile: The pile before the first loading.
-        inputs: What `decide` is given, leaves with leading axis N.
-        decide: `decide(pile, inputs_n) -> (pose, action)` of one loading.
-        record: `record(pile_before, pose, action, *outcome)`: what is kept of a loading.
+        load: `load(state, inputs_n) -> (state_after, record)` of one loading.
+        state: Before the first: the pile, and what else there is to carry along.
+        inputs: What loadings are given, leaves with leading axis N.
 
     Returns:
-        The pile after the last loading, and the records, leaves with leading axis N.
+        The state after the last loading, and the records, leaves with leading axis N.
     """
-
-    @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(PENETRATION))
-    def load(pile: Pile, inputs_n: PyTree) -> tuple[Pile, PyTree]:
-        pose, action = decide(pile, inputs_n)
-        after, *outcome = play(pile, pose, action)
-        return after, record(pile, pose, action, *outcome)
-
-    return lax.scan(load, pile, inputs)
+    policy = jax.checkpoint_policies.save_only_these_names(PENETRATION)
+    return lax.scan(jax.checkpoint(load, policy=policy), state, inputs)

@@ -19,6 +19,7 @@ from wlplan.planning.job import (
     check_has_gradient,
     contour_length,
     costs_and_gradients,
+    cusps_of_plans,
 )
 from wlplan.planning.planners.greedy import Greedy
 from wlplan.planning.planners.nominal import Nominal
@@ -47,6 +48,8 @@ class Gradient:
     # start as the iterations go.
     candidates: int = 16
     snapshot_every: int = 4
+    # How often the ways are searched for; in between they move with the poses.
+    search_every: int = 8
     # Where the first two starts come from.
     greedy: Greedy = _GREEDY
     nominal: Nominal = _NOMINAL
@@ -73,6 +76,15 @@ class Gradient:
         # Every plan that may be handed on: cost, and decisions with a leading axis of one.
         snapshots: list[tuple[float, Decisions]] = []
         limit = np.inf
+        step_number, cusps = 0, None
+
+        def evaluate(decisions: Decisions) -> tuple[Array, Decisions]:
+            nonlocal step_number, cusps
+            if step_number % self.search_every == 0:
+                cusps = cusps_of_plans(job, decisions)
+            step_number += 1
+            found: tuple[Array, Decisions] = costs_and_gradients(job, (decisions, cusps))
+            return found
 
         def visit(number: int, costs: Array, descent: Descent) -> None:
             nonlocal limit
@@ -87,7 +99,7 @@ class Gradient:
                 progress("gradient", number, self.iterations, reached)
 
         last = descend_stepwise(
-            lambda decisions: costs_and_gradients(job, decisions),
+            evaluate,
             begin(start, self._optimiser(length)),
             functools.partial(_advance, length=length, planner=self),
             self.iterations + 1,

@@ -18,9 +18,11 @@ from wlplan.planning.job import (
     Job,
     can_refine,
     costs_and_gradients,
+    cusps_of_plans,
     outcomes,
 )
 from wlplan.planning.proposals import Progress, Proposals
+from wlplan.planning.search import Cusps
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,12 +53,17 @@ class Nominal:
         random = np.random.default_rng(seed)
         trials = spread_actions(self.rows * batches, random, job.pile.height.dtype)
         total = batches + (self.refine_steps if refines else 0)
+        # All plans dig at the same poses, so they have the same ways, but for the soil around.
+        cusps: Cusps | None = None
+        if refines:
+            cusps = cusps_of_plans(job, evenly_spread(job, loads, trials[:1]))
+            cusps = jax.tree.map(lambda leaf: jnp.repeat(leaf, self.rows, axis=0), cusps)
 
         def evaluate(actions: Array) -> tuple[Array, Array]:
             plans = evenly_spread(job, loads, actions)
             if not refines:
                 return outcomes(job, plans).cost, jnp.zeros_like(actions)
-            costs, gradients = costs_and_gradients(job, plans)
+            costs, gradients = costs_and_gradients(job, (plans, cusps))
             # All loadings share the action.
             return costs, gradients.action.sum(axis=1)
 
