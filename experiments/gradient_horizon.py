@@ -15,7 +15,8 @@ import wlplan
 from experiments._common.results import main
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.io import write_bytes_atomic
-from wlplan.planning.job import Decisions, Job, make_job, outcomes, with_toe
+from wlplan.planning.job import Decisions, Job, make_job, with_toe
+from wlplan.planning.playing import outcomes
 from wlplan.report.figures import png_bytes
 from wlplan.studies.gradcheck import as_table, cost_and_gradient
 from wlplan.types import LoadingPlan

@@ -15,8 +15,9 @@ import numpy as np
 import wlplan
 from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
-from wlplan.planning.job import Decisions, contour_length, make_job, outcomes, with_toe
+from wlplan.planning.job import Decisions, contour_length, make_job, with_toe
 from wlplan.planning.planners import Gradient, Greedy, Nominal
+from wlplan.planning.playing import outcomes
 from wlplan.report.figures import png_bytes
 
 KIND, SLOPE_DEGREES, SEED, LOADS = "conical", 30.0, 1, 10

@@ -22,8 +22,8 @@ from wlplan.errors import InputError
 from wlplan.io.upright import TURNS
 from wlplan.planning import objective
 from wlplan.planning import plan as planner
-from wlplan.planning.job import PlanResult
 from wlplan.planning.loading import Transport
+from wlplan.planning.playing import PlanResult
 from wlplan.report import figures as plots
 from wlplan.report import page as report
 from wlplan.site.frame import Frame

@@ -14,10 +14,10 @@ from laws import assert_gradient
 import wlplan
 from wlplan.actions import squash, unsquash
 from wlplan.errors import InputError
-from wlplan.planning.job import PlanResult
 from wlplan.planning.loading import Loading
 from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.planners import Gradient, Greedy, Nominal
+from wlplan.planning.playing import PlanResult
 from wlplan.planning.poses import distance_to_toe, pose_at, toe_of
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site

@@ -14,7 +14,8 @@ from precision import in_float64
 
 import wlplan
 from wlplan.engines.simulator import Simulator
-from wlplan.planning.job import make_job, play_candidate
+from wlplan.planning.job import make_job
+from wlplan.planning.playing import play_candidate
 from wlplan.planning.rollout import load_by_load, rollout
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site

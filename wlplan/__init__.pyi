@@ -10,13 +10,13 @@ from .io.plans import write_plan as write_plan
 from .io.summary import info as info
 from .planning import planners as planners
 from .planning.job import Job as Job
-from .planning.job import PlanResult as PlanResult
 from .planning.loading import Loading as Loading
 from .planning.objective import Constraint as Constraint
 from .planning.objective import Objective as Objective
 from .planning.objectives import OBJECTIVES as OBJECTIVES
 from .planning.plan import plan_loads as plan_loads
 from .planning.plan import play as play
+from .planning.playing import PlanResult as PlanResult
 from .planning.proposals import Proposals as Proposals
 from .planning.rollout import rollout as rollout
 from .report.figures import diggability_figure as diggability_figure

@@ -199,6 +199,9 @@ class LoadingPlan(struct.PyTreeNode):
 
     pose: Pose
     action: Action
+    # The truck that each load goes to, counted from 0; -1: the load is not made. None: all loads
+    # are made, and who follows the plan knows when a truck leaves.
+    truck: Int[Array, "*batch"] | None = None
 
 
 @no_type_check

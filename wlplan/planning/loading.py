@@ -19,6 +19,8 @@ class Transport(struct.PyTreeNode):
     work: Float[Array, "*n"]  # [kJ]
     # How much of the way and of the approach lane leads through what must not be touched [m].
     touching: Float[Array, "*n"] = 0.0  # type: ignore[assignment]
+    # How long the loader then stands still until the next truck is there [s].
+    wait: Float[Array, "*n"] = 0.0  # type: ignore[assignment]
 
 
 @no_type_check

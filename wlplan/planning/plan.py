@@ -12,18 +12,12 @@ import numpy as np
 from wlplan.checks import check_plan
 from wlplan.errors import InputError
 from wlplan.planning import planners
-from wlplan.planning.job import (
-    Decisions,
-    Job,
-    PlanResult,
-    assemble,
-    assess,
-    make_job,
-    outcomes,
-    with_toe,
-)
+from wlplan.planning.amounts import Amount, Loads, typical_load
+from wlplan.planning.job import Decisions, Job, Standing, beginning, make_job, with_toe
 from wlplan.planning.objective import Objective
+from wlplan.planning.playing import PlanResult, assemble, assess, leaves_after, outcomes
 from wlplan.planning.proposals import Planner, Progress, Proposals
+from wlplan.planning.watch import BudgetSpent, Watch
 from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour
 from wlplan.types import LoadingPlan, Pile, World
@@ -37,22 +31,28 @@ def plan_loads(
     world: World,
     pile: Pile,
     *,
-    loads: int = 15,
-    objective: str | Objective | Mapping[str, Any] | Callable[..., Any] = "efficiency",
+    loads: int | None = None,
+    amount: Amount | None = None,
+    objective: str | Objective | Mapping[str, Any] | Callable[..., Any] | None = None,
     planner: str | Planner = "gradient",
     site: Site | None = None,
     seed: int = 0,
     referee: World | None = None,
     progress: Progress | None = None,
+    budget: float | None = None,
     contour: ToeContour | None = None,
 ) -> PlanResult:
     """Plans the next loadings from a pile.
 
+    Ctrl-C and a budget end the search: the best plan so far is the result, which says so.
+
     Args:
         world: World to plan in.
         pile: The pile as it is, relaxed or as scanned.
-        loads: Number of loadings.
+        loads: Number of loadings; default 15, if there is no amount either.
+        amount: How much is to be loaded: `Loads`, `Tonnes`, `Trucks` or `Empty`.
         objective: A name, an `Objective`, a mapping of named terms, or a function of a loading.
+            Default: "efficiency" for a number of loads, "delivery" for other amounts.
         planner: A name of `wlplan.planners.NAMES`, or a planner with settings of its own.
         site: Machine, soil and receiver; default: the WA320 in gravel, and the follow-up's
             receiver beside the pile.
@@ -62,6 +62,7 @@ def plan_loads(
             it dug at. A candidate that costs more in `world` than the planner's limit, for the
             gradient planner the greedy plan, is out. None: `world` picks, with its own poses.
         progress: Called as the planner advances.
+        budget: Most loadings that a planner of ours may evaluate, see `wlplan.planning.watch`.
         contour: The toe to dig along; default: that of the pile.
 
     Returns:
@@ -71,17 +72,38 @@ def plan_loads(
     Raises:
         InputError: If there is nothing to dig, no load is asked for, a name is unknown, the
             planner needs a gradient that the world does not have, or no plan has a finite cost.
+        KeyboardInterrupt: If there was no plan yet.
     """
-    if loads < 1:
-        raise InputError(f"{loads} loads were asked for: ask for at least 1.")
-    job = with_toe(make_job(world, pile, site=site, objective=objective, contour=contour), contour)
-    chosen = planner_of(planner, job.world)
-    proposals = chosen.propose(job, loads, seed=seed, progress=progress)
-    if referee is None:
-        return choose(job, proposals)
-    return choose(
-        job, proposals, referee=make_job(referee, pile, site=job.site, contour=contour).world
+    if amount is None:
+        amount = Loads(15 if loads is None else loads)
+    elif loads is not None:
+        raise InputError("both loads and an amount are given: give one of them.")
+    if objective is None:
+        objective = "efficiency" if isinstance(amount, Loads) else "delivery"
+    job = with_toe(
+        make_job(world, pile, site=site, objective=objective, amount=amount, contour=contour),
+        contour,
     )
+    chosen = planner_of(planner, job.world)
+    rows = amount.rows(typical_load(job.site))
+    watch, stopped = Watch(progress, budget), ""
+    try:
+        proposals = chosen.propose(job, rows, seed=seed, progress=watch)
+    except (KeyboardInterrupt, BudgetSpent) as error:
+        if watch.best is None:
+            if isinstance(error, BudgetSpent):
+                raise InputError(
+                    f"a budget of {budget:g} loadings is too small for a first plan."
+                ) from None
+            raise
+        proposals = Proposals(watch.best.plan)
+        stopped = "budget" if isinstance(error, BudgetSpent) else "interrupted"
+    if referee is None:
+        result = choose(job, proposals)
+    else:
+        checked = make_job(referee, pile, site=job.site, contour=contour)
+        result = choose(job, proposals, referee=checked.world)
+    return result.replace(spent=watch.spent, stopped=stopped)
 
 
 def planner_of(planner: str | Planner, world: World) -> Planner:
@@ -118,9 +140,15 @@ def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> P
         InputError: If no plan has a finite cost.
     """
     rows = _rows(proposals)
-    judged = outcomes(job if referee is None else job.replace(world=as_pytree(referee)), rows)
-    # The toe is where the referee's pile begins, so the poses are the ones it was played with.
-    seen = judged if referee is None else outcomes(job, judged.plan)
+    if referee is None:
+        seen = judged = outcomes(job, rows)
+    else:
+        if rows.truck is None and not isinstance(job.amount, Loads):
+            # The referee is to fill the trucks that were planned for.
+            rows = rows.replace(truck=outcomes(job, rows).plan.truck)
+        judged = outcomes(job.replace(world=as_pytree(referee)), rows)
+        # The toe is where the referee's pile begins, so the poses are the ones it was played with.
+        seen = outcomes(job, judged.plan)
     costs = np.asarray(seen.cost)
     allowed = np.isfinite(np.asarray(judged.cost))
     if proposals.limit is not None and np.isfinite(costs[-1]):
@@ -130,8 +158,27 @@ def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> P
             "no plan has a finite cost: check the pile for spikes, and the terms of the objective."
         )
     winner = int(np.argmin(np.where(allowed, np.asarray(judged.cost), np.inf)))
-    result = _member(seen, winner)
-    return result if referee is None else result.replace(refereed=_member(judged, winner))
+    result = _made(job, _member(seen, winner))
+    if referee is None:
+        return result
+    return result.replace(refereed=_made(job, _member(judged, winner)))
+
+
+def _made(job: Job, result: PlanResult) -> PlanResult:
+    """A result without the rows of its plan that are not made."""
+    truck = result.plan.truck
+    if truck is None:
+        return result
+    rows = np.flatnonzero(np.asarray(truck) >= 0)
+    of_loads = {
+        name: jax.tree.map(lambda leaf: leaf[rows], getattr(result, name))
+        for name in ("plan", "transport", "terms", "misfit", "costs", "faces", "ways", "solves")
+    }
+    performance = jax.tree.map(lambda leaf: leaf[rows], result.rollout.performance)
+    made = result.replace(rollout=result.rollout.replace(performance=performance), **of_loads)
+    if isinstance(job.amount, Loads):
+        return made.replace(plan=made.plan.replace(truck=None))
+    return made
 
 
 def _rows(proposals: Proposals) -> Decisions | LoadingPlan:
@@ -155,6 +202,7 @@ def play(
     plan: LoadingPlan,
     *,
     objective: str | Objective | Mapping[str, Any] | Callable[..., Any] = "efficiency",
+    amount: Amount | None = None,
     site: Site | None = None,
     note: Callable[[str], None] = lambda text: None,
     record: Callable[[int, Any], None] = lambda number, record: None,
@@ -164,8 +212,9 @@ def play(
     Args:
         world: World to play in.
         pile: The pile before the first loading.
-        plan: Poses and actions.
+        plan: Poses and actions, and the trucks that the loads go to where there are some.
         objective: As for `plan_loads`.
+        amount: What the plan was to load, for trucks that wait and loads that do not fit them.
         site: Machine, soil and receiver, as for `plan_loads`.
         note: Called with what is worth knowing, by worlds that play load by load.
         record: `record(number, record)`, called after each loading, counted from 1, by worlds
@@ -175,11 +224,16 @@ def play(
         InputError: If the world is a name, the plan makes no sense, or a height is not finite.
     """
     check_plan(plan)
-    job = make_job(world, pile, site=site, objective=objective)
+    given = Loads(len(plan.pose.x)) if amount is None else amount
+    job = make_job(world, pile, site=site, objective=objective, amount=given)
     if hasattr(job.world, "play_load"):
         return _play_load_by_load(job, plan, note, record)
-    plan = jax.tree.map(lambda leaf: jnp.asarray(leaf, pile.height.dtype)[None], plan)
-    return _member(outcomes(job, plan), 0)
+    dtype = pile.height.dtype
+    pose, action = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, dtype)[None], (plan.pose, plan.action)
+    )
+    truck = None if plan.truck is None else jnp.asarray(plan.truck)[None]
+    return _made(job, _member(outcomes(job, LoadingPlan(pose, action, truck)), 0))
 
 
 def _play_load_by_load(
@@ -190,14 +244,16 @@ def _play_load_by_load(
 ) -> PlanResult:
     for text in getattr(job.world, "notes", list)():
         note(text)
-    pile, loadings, play_one = job.pile, [], cast(Any, job.world).play_load
+    standing, loadings, play_one = beginning(job), [], cast(Any, job.world).play_load
+    leaves = None if plan.truck is None else leaves_after(jnp.asarray(plan.truck))
     for n in range(len(plan.pose.x)):
-        pose, action = jax.tree.map(lambda leaf, n=n: leaf[n], (plan.pose, plan.action))
-        after, performance, what = play_one(pile, pose, action, note)
-        loadings.append(assess(job, pile, pose, action, performance))
-        pile = after
+        one, last = jax.tree.map(lambda leaf, n=n: leaf[n], (plan, leaves))
+        after, performance, what = play_one(standing.pile, one.pose, one.action, note)
+        loading, done = assess(job, standing, one, performance, leaves=last)
+        loadings.append(loading)
+        standing = Standing(after, done)
         record(n + 1, what)
-    return assemble(jax.tree.map(lambda *leaves: jnp.stack(leaves), *loadings), pile)
+    return assemble(job, jax.tree.map(lambda *leaves: jnp.stack(leaves), *loadings), standing)
 
 
 def _member(batch: PlanResult, k: int) -> PlanResult:

@@ -38,13 +38,14 @@ class InverseMass:
 
 @dataclasses.dataclass(frozen=True)
 class CycleTime:
-    """T / T0: the time of a cycle, transport included, over a typical one [1]."""
+    """T / T0: the time of a cycle, transport and waiting included, over a typical one [1]."""
 
     reference: float = 46.3  # [s]
 
     def __call__(self, loading: Loading) -> Float[Array, ""]:
         """The term of a loading."""
-        return (loading.performance.time + loading.transport.time) / self.reference
+        carried = loading.transport
+        return (loading.performance.time + carried.time + carried.wait) / self.reference
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from wlplan.constants import KG_PER_TONNE, QUANTITIES
 from wlplan.io.plans import plan_to_dict
 from wlplan.planning.clearance import clearance
-from wlplan.planning.job import PlanResult
+from wlplan.planning.playing import PlanResult
 from wlplan.planning.way import points_of
 from wlplan.planning.yard import unpacked_soil
 from wlplan.report.plausibility import remarks_on

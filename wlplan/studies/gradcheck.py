@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.errors import InputError
-from wlplan.planning.job import Job, check_has_gradient, outcomes, play_candidate
+from wlplan.planning.job import Job, check_has_gradient
+from wlplan.planning.playing import outcomes, play_candidate
 from wlplan.terrain.toe import ToeContour, check_accessible, toe_contour
 from wlplan.types import LoadingPlan, Pile, Pose, action_from, action_vector
 from wlplan.worlds.capabilities import with_derivatives

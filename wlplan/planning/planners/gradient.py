@@ -13,17 +13,12 @@ import optax
 from jaxtyping import Array, Float
 
 from wlplan.planning.descent import Descent, begin, descend_stepwise, least, step
-from wlplan.planning.job import (
-    Decisions,
-    Job,
-    check_has_gradient,
-    contour_length,
-    costs_and_gradients,
-    cusps_of_plans,
-)
+from wlplan.planning.job import Decisions, Job, check_has_gradient, contour_length
 from wlplan.planning.planners.greedy import Greedy
 from wlplan.planning.planners.nominal import Nominal
+from wlplan.planning.playing import costs_and_gradients, cusps_of_plans
 from wlplan.planning.proposals import Progress, Proposals
+from wlplan.planning.watch import watching
 
 _GREEDY, _NOMINAL = Greedy(), Nominal(refine_steps=6)
 
@@ -66,8 +61,11 @@ class Gradient:
             InputError: If the world has no derivative.
         """
         check_has_gradient(job, "plan in a learned world, or use the greedy or the nominal planner")
-        base: Any = self.greedy.propose(job, loads, seed=seed, progress=progress).candidates
-        even: Any = self.nominal.propose(job, loads, seed=seed, progress=progress).candidates
+        watch = watching(progress)
+        base: Any = self.greedy.propose(job, loads, seed=seed, progress=watch).candidates
+        even: Any = self.nominal.propose(job, loads, seed=seed, progress=watch).candidates
+        # All have the trucks of the greedy plan: which load is a truck's last has no gradient.
+        trucks, base = base.truck, base.replace(truck=None)
         length = contour_length(job)
         random = np.random.default_rng([seed, 1])
         shaken = (self._perturbed(base, length, random) for _ in range(self.starts))
@@ -78,12 +76,20 @@ class Gradient:
         limit = np.inf
         step_number, cusps = 0, None
 
+        def with_trucks(plans: Decisions) -> Decisions:
+            count = len(plans.position)
+            return plans.replace(truck=None if trucks is None else jnp.repeat(trucks, count, 0))
+
         def evaluate(decisions: Decisions) -> tuple[Array, Decisions]:
             nonlocal step_number, cusps
             if step_number % self.search_every == 0:
+                watch.spend(self.starts * loads)
                 cusps = cusps_of_plans(job, decisions)
             step_number += 1
-            found: tuple[Array, Decisions] = costs_and_gradients(job, (decisions, cusps))
+            watch.spend(self.starts * loads, self.starts * loads)
+            found: tuple[Array, Decisions] = costs_and_gradients(
+                job, (with_trucks(decisions), cusps)
+            )
             return found
 
         def visit(number: int, costs: Array, descent: Descent) -> None:
@@ -94,9 +100,12 @@ class Gradient:
             if number % self.snapshot_every == 0:
                 found = np.flatnonzero(np.isfinite(values))
                 snapshots.extend((float(values[r]), _row(descent.variables, int(r))) for r in found)
-            if progress is not None:
-                reached = min(least(descent.best_costs), least(values))
-                progress("gradient", number, self.iterations, reached)
+            if np.isfinite(values).any():
+                row = int(np.nanargmin(values))
+                plan = with_trucks(_row(descent.variables, row))
+                watch.keep(jax.tree.map(lambda leaf: leaf[0], plan), float(values[row]))
+            reached = min(least(descent.best_costs), least(values))
+            watch("gradient", number, self.iterations, reached)
 
         last = descend_stepwise(
             evaluate,
@@ -118,7 +127,8 @@ class Gradient:
         candidates = jax.tree.map(
             lambda *leaves: jnp.concatenate(leaves), *[cheap[k] for k in picks]
         )
-        return Proposals(candidates, limit=jax.tree.map(lambda leaf: leaf[0], base))
+        limit_plan = jax.tree.map(lambda leaf: leaf[0], with_trucks(base))
+        return Proposals(with_trucks(candidates), limit=limit_plan)
 
     def _optimiser(self, length: Float[Array, ""]) -> optax.GradientTransformation:
         """Adam with a step length for each kind of variable."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,16 +14,11 @@ from jaxtyping import Array, Float
 
 from wlplan.actions import spread_actions
 from wlplan.planning.descent import Descent, begin, descend_stepwise, least, step
-from wlplan.planning.job import (
-    Decisions,
-    Job,
-    can_refine,
-    costs_and_gradients,
-    cusps_of_plans,
-    outcomes,
-)
+from wlplan.planning.job import Decisions, Job, can_refine
+from wlplan.planning.playing import costs_and_gradients, cusps_of_plans, outcomes
 from wlplan.planning.proposals import Progress, Proposals
 from wlplan.planning.search import Cusps
+from wlplan.planning.watch import watching
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +44,7 @@ class Nominal:
         self, job: Job, loads: int, *, seed: int, progress: Progress | None = None
     ) -> Proposals:
         """One plan, leaves [1, N]; arguments as of `Planner.propose`."""
+        watch = watching(progress)
         refines = can_refine(job, self.refine_steps)
         batches = -(-self.actions // self.rows)
         random = np.random.default_rng(seed)
@@ -61,27 +58,34 @@ class Nominal:
 
         def evaluate(actions: Array) -> tuple[Array, Array]:
             plans = evenly_spread(job, loads, actions)
+            watch.spend(loads * len(actions), loads * len(actions) if refines else 0)
             if not refines:
                 return outcomes(job, plans).cost, jnp.zeros_like(actions)
             costs, gradients = costs_and_gradients(job, (plans, cusps))
             # All loadings share the action.
             return costs, gradients.action.sum(axis=1)
 
+        def keep(actions: Array, costs: Any) -> None:
+            values = np.nan_to_num(np.asarray(costs), nan=np.inf)
+            best = int(np.argmin(values))
+            plan = evenly_spread(job, loads, actions[best : best + 1])
+            watch.keep(jax.tree.map(lambda leaf: leaf[0], plan), float(values[best]))
+
         tried: list[np.ndarray] = []
         for k in range(batches):
             costs, _ = evaluate(trials[k * self.rows : (k + 1) * self.rows])
             tried.append(np.asarray(costs))
-            if progress is not None:
-                progress("nominal", k + 1, total, least(np.concatenate(tried)))
+            keep(trials[k * self.rows : (k + 1) * self.rows], tried[-1])
+            watch("nominal", k + 1, total, least(np.concatenate(tried)))
         costs_of_trials = np.nan_to_num(np.concatenate(tried), nan=np.inf, posinf=np.inf)
         order = np.argsort(costs_of_trials)
         best, lowest = trials[order[0]], float(costs_of_trials[order[0]])
         if refines:
 
             def visit(number: int, costs: Array, descent: Descent) -> None:
-                if progress is not None:
-                    reached = min(lowest, least(costs), least(descent.best_costs))
-                    progress("nominal", batches + number + 1, total, reached)
+                reached = min(lowest, least(costs), least(descent.best_costs))
+                keep(descent.variables, costs)
+                watch("nominal", batches + number + 1, total, reached)
 
             last = descend_stepwise(
                 evaluate,

@@ -1,0 +1,293 @@
+"""The search of a next load: many poses and actions, the best of them refined by gradient."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int
+
+from wlplan.actions import spread_actions
+from wlplan.planning.amounts import Outlook, Trucks
+from wlplan.planning.descent import descend
+from wlplan.planning.job import Decisions, Job, Standing, can_refine, contour_length
+from wlplan.planning.search import Cusps
+from wlplan.planning.stepping import cusps_of_next, next_load, score_of, score_of_next
+from wlplan.planning.watch import Watch
+from wlplan.types import Pile
+from wlplan.xla import ParallelMap, floats
+
+
+class Tried(NamedTuple):
+    """Loads that could be made next: every action at every pose."""
+
+    poses: Float[np.ndarray, "p 2"]  # positions along the toe, and heading offsets
+    cusps: Cusps  # of the ways from there, leaves [p, ...]
+    actions: Float[Array, "a 4"]  # before squashing
+    costs: Float[np.ndarray, "p a"]  # infinite where there is none
+    masses: Float[np.ndarray, "p a"]  # [tonne]
+
+
+class Ranked(NamedTuple):
+    """The best of them, each at a pose of its own, in no order."""
+
+    decisions: Decisions  # leaves [K]
+    cusps: Cusps  # leaves [K, ...]
+    scores: Float[np.ndarray, " k"]  # cost of each and of what it leaves to do
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadSearch:
+    """How next loads are searched for; what planners have in common that go load by load.
+
+    In a world without a derivative nothing is refined.
+    """
+
+    # Poses a metre of contour, heading offsets before squashing, and actions that are tried.
+    poses_per_metre: float = 1.5
+    offsets: tuple[float, ...] = (-0.6, 0.0, 0.6)
+    actions: int = 24
+    # So many poses in a row have the ways of the first of them, shifted with the pose.
+    neighbours: int = 2
+    # Candidates that are refined, each at a pose of its own, and steps and rate of Adam.
+    refined: int = 8
+    refine_steps: int = 30
+    refine_rate: float = 0.08
+    # Candidates that are evaluated at once: bounds the memory.
+    batch: int = 256
+
+    def attempt(
+        self, job: Job, standing: Standing, random: np.random.Generator, watch: Watch
+    ) -> Tried:
+        """Tries every action at every pose.
+
+        Args:
+            job: With its toe.
+            standing: Before the loading.
+            random: Source of a shift of all poses, so that they are not tied to one raster, and of
+                the actions.
+            watch: Told what it took.
+        """
+        dtype = job.pile.height.dtype
+        count = max(8, round(self.poses_per_metre * float(contour_length(job))))
+        positions = (np.arange(count) + random.random()) / count
+        poses = np.stack(np.meshgrid(positions, self.offsets, indexing="ij"), -1)
+        poses = poses.reshape(-1, 2).astype(dtype)
+        actions = spread_actions(self.actions, random, dtype)
+        searched = positions[:: self.neighbours].astype(dtype)
+        cusps = _cusps_at(job, standing.pile, searched, batch=self.batch // self.actions)
+        of_pose = np.arange(len(poses)) // (self.neighbours * len(self.offsets))
+        cusps = jax.tree.map(lambda leaf: leaf[of_pose], cusps)
+        costs, masses = self._costs(job, standing, poses, cusps, actions)
+        watch.spend(costs.size)
+        return Tried(poses, cusps, actions, costs, masses)
+
+    def outlook(self, job: Job, standing: Standing, tried: Tried, watch: Watch) -> Outlook:
+        """What loads are like, by those that were tried.
+
+        How many buckets a truck takes hangs on what a good one and a full one hold, so for trucks
+        the best are refined first.
+        """
+        good = _cheapest(tried.costs, tried.masses)
+        if not isinstance(job.amount, Trucks) or not can_refine(job, self.refine_steps):
+            most = int(np.argmax(np.where(np.isfinite(tried.costs), tried.masses, -np.inf)))
+            return _outlook(good, (tried.costs.flat[most], tried.masses.flat[most]))
+        loads = []
+        for factor in (1.0, _WORTH):
+            priced = _outlook(good, good, price=factor * good[0] / good[1])
+            best = self.best(job, standing, tried, priced, watch)
+            rows = np.arange(len(best.scores))
+            poses = np.stack([best.decisions.position, best.decisions.offset], axis=1)
+            # As many actions as always: what evaluates them is compiled for it.
+            actions = jnp.asarray(np.resize(best.decisions.action, (self.actions, 4)))
+            costs, masses = self._costs(job, standing, poses, best.cusps, actions)
+            watch.spend(len(rows))
+            chosen = rows, rows % self.actions
+            found = costs[chosen], masses[chosen]
+            if factor > 1.0:
+                row = int(np.argmin(best.scores))
+                loads.append((float(found[0][row]), float(found[1][row])))
+            else:
+                loads.append(_cheapest(*found))
+        return _outlook(*loads)
+
+    def best(
+        self, job: Job, standing: Standing, tried: Tried, outlook: Outlook, watch: Watch
+    ) -> Ranked:
+        """The best of what was tried, refined.
+
+        Args:
+            job: With its toe.
+            standing: Before the loading.
+            tried: What `attempt` found.
+            outlook: What the loads after it will be like.
+            watch: Told what it took.
+        """
+        scores = _scores(job, standing, tried.costs, tried.masses, outlook)
+        # One start a pose, so that refinement does not begin in the same place eight times.
+        rows = np.argsort(scores.min(axis=1))[: self.refined]
+        starts = Decisions(
+            position=jnp.asarray(tried.poses[rows, 0]),
+            offset=jnp.asarray(tried.poses[rows, 1]),
+            action=tried.actions[scores.argmin(axis=1)[rows]],
+        )
+        cusps = jax.tree.map(lambda leaf: leaf[rows], tried.cusps)
+        if not can_refine(job, self.refine_steps):
+            return Ranked(starts, cusps, scores.min(axis=1)[rows])
+        count = self.refine_steps * len(rows)
+        watch.spend(count, count)
+        decisions, refined = _refine(
+            job,
+            standing,
+            starts,
+            (outlook, cusps),
+            steps=self.refine_steps,
+            rate=self.refine_rate,
+        )
+        return Ranked(decisions, cusps, np.asarray(refined))
+
+    def _costs(
+        self,
+        job: Job,
+        standing: Standing,
+        poses: Float[np.ndarray, "p 2"],
+        cusps: Cusps,
+        actions: Float[Array, "a 4"],
+    ) -> tuple[Float[np.ndarray, "p a"], Float[np.ndarray, "p a"]]:
+        """Cost of every action at every pose, infinite where it is none, and mass [tonne]."""
+        count = len(poses)
+        rows = _portions(count, max(1, self.batch // len(actions)))
+        parts = jax.tree.map(lambda leaf: leaf[rows], (poses, cusps))
+        found = _costs_of_portions((job, standing, actions), parts)
+        costs, masses = (np.asarray(leaf).reshape(-1, len(actions))[:count] for leaf in found)
+        return np.nan_to_num(costs, nan=np.inf, posinf=np.inf), masses
+
+
+# Scores are computed in multiples of so many.
+_BLOCK = 4096
+# A fuller load is worth it up to so many times the price of a tonne.
+_WORTH = 2.0
+
+_At = tuple[Any, Cusps]
+"""Poses [p, 2], as positions along the toe and heading offsets, and cusps of the ways."""
+
+
+def _costs_at_poses(
+    shared: tuple[Job, Standing, Float[Array, "a 4"]], at: _At
+) -> tuple[Float[Array, "p a"], Float[Array, "p a"]]:
+    """Cost and mass [tonne] of every action at every pose.
+
+    What depends on the pose alone is computed once.
+    """
+    job, standing, actions = shared
+
+    def at_pose(pose: Array, cusps: Cusps) -> tuple[Array, Array]:
+        def one(action: Array) -> tuple[Array, Array]:
+            found = next_load(job, standing, Decisions(pose[0], pose[1], action), cusps)
+            return found.cost, found.performance.mass
+
+        return jax.vmap(one)(actions)
+
+    return jax.vmap(at_pose)(*at)
+
+
+def _cusps_of_some(shared: tuple[Job, Pile], positions: Float[Array, " p"]) -> Cusps:
+    job, pile = shared
+    return jax.vmap(lambda at: cusps_of_next(job, pile, at, jnp.zeros_like(at)))(positions)
+
+
+_costs_of_portions, _cusps_of_portions = ParallelMap(_costs_at_poses), ParallelMap(_cusps_of_some)
+
+
+def _portions(count: int, size: int) -> Int[np.ndarray, "portions size"]:
+    """Rows in portions of one shape; the last row fills the last portion up.
+
+    The number of poses follows from the length of the toe; if that were a shape, every next pile
+    would be compiled for.
+    """
+    portions = -(-count // size)
+    rows: np.ndarray = np.minimum(np.arange(portions * size), count - 1).reshape(portions, size)
+    return rows
+
+
+def _cusps_at(job: Job, pile: Pile, positions: Float[np.ndarray, " p"], *, batch: int) -> Cusps:
+    """Cusps of the ways from positions along the toe, square to it."""
+    rows = _portions(len(positions), max(1, batch))
+    found = _cusps_of_portions((job, pile), positions[rows])
+    joined: Cusps = jax.tree.map(
+        lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:])[: len(positions)], found
+    )
+    return joined
+
+
+_Load = tuple[float, float]
+"""Cost and mass [tonne] of a load."""
+
+
+def _cheapest(costs: Float[np.ndarray, "*n"], masses: Float[np.ndarray, "*n"]) -> _Load:
+    """The load that costs least a tonne."""
+    per_tonne = np.where(masses > 0.0, costs / np.maximum(masses, 1e-6), np.inf)
+    best = int(np.argmin(per_tonne))
+    return float(costs.flat[best]), float(masses.flat[best])
+
+
+def _outlook(good: _Load, full: _Load, price: float = 0.0) -> Outlook:
+    return Outlook(*(floats(np.asarray(number)) for number in (*good, *full, price)))
+
+
+def _scores(
+    job: Job,
+    standing: Standing,
+    costs: Float[np.ndarray, "p a"],
+    masses: Float[np.ndarray, "p a"],
+    outlook: Outlook,
+) -> Float[np.ndarray, "p a"]:
+    """Cost of every action at every pose and of what is then left to do."""
+    # Always about the same shape, see `_portions`.
+    size = -(-costs.size // _BLOCK) * _BLOCK
+    flat = (np.resize(values, size) for values in (costs, masses))
+    found: np.ndarray = np.asarray(_scores_of(job, standing, *flat, outlook))
+    return found[: costs.size].reshape(costs.shape)
+
+
+@jax.jit
+def _scores_of(
+    job: Job, standing: Standing, costs: Array, masses: Array, outlook: Outlook
+) -> Float[Array, " n"]:
+    return jax.vmap(lambda cost, mass: score_of(job, standing, cost, mass, outlook))(costs, masses)
+
+
+@functools.partial(jax.jit, static_argnames=("steps", "rate"))
+def _refine(
+    job: Job,
+    standing: Standing,
+    starts: Decisions,
+    known: tuple[Outlook, Cusps],
+    *,
+    steps: int,
+    rate: float,
+) -> tuple[Decisions, Float[Array, " k"]]:
+    """Adam on single loadings, from several starts; returns the best visited of each.
+
+    The ways keep their cusps, which move with the pose.
+    """
+    length = contour_length(job)
+    outlook, cusps = known
+
+    def score(variables: Decisions, cusps: Cusps) -> Array:
+        # Metres along the contour, so that one rate suits all variables.
+        decisions = variables.replace(position=variables.position / length)
+        return score_of_next(job, standing, decisions, outlook, cusps)
+
+    best, scores = descend(
+        lambda variables: jax.vmap(jax.value_and_grad(score))(variables, cusps),
+        starts.replace(position=starts.position * length),
+        optax.adam(optax.cosine_decay_schedule(rate, steps)),
+        steps,
+    )
+    return best.replace(position=best.position / length), scores
