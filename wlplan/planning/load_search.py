@@ -114,7 +114,8 @@ class LoadSearch:
                 loads.append((float(found[0][row]), float(found[1][row])))
             else:
                 loads.append(_cheapest(*found))
-        return _outlook(*loads)
+        good, full = loads
+        return _outlook(good, full)
 
     def best(
         self, job: Job, standing: Standing, tried: Tried, outlook: Outlook, watch: Watch
