@@ -101,13 +101,13 @@ class LoadSearch:
         for factor in (1.0, _WORTH):
             priced = _outlook(good, good, price=factor * good[0] / good[1])
             best = self.best(job, standing, tried, priced, watch)
-            rows = np.arange(len(best.scores))
+            rows = np.arange(min(len(best.scores), self.actions))
             poses = np.stack([best.decisions.position, best.decisions.offset], axis=1)
             # As many actions as always: what evaluates them is compiled for it.
             actions = jnp.asarray(np.resize(best.decisions.action, (self.actions, 4)))
             costs, masses = self._costs(job, standing, poses, best.cusps, actions)
             watch.spend(len(rows))
-            chosen = rows, rows % self.actions
+            chosen = rows, rows
             found = costs[chosen], masses[chosen]
             if factor > 1.0:
                 row = int(np.argmin(best.scores))
