@@ -300,15 +300,22 @@ def loads_option(*, default: int, most: int, remark: str = "") -> Callable[[Any]
     )
 
 
-def objective_option(purpose: str) -> Callable[[Any], Any]:
-    """The option that says what a plan costs; `purpose` is its help."""
+def objective_option(purpose: str, *, by_amount: bool = False) -> Callable[[Any], Any]:
+    """The option that says what a plan costs.
+
+    Args:
+        purpose: Its help.
+        by_amount: Whether the default hangs on how much is to be loaded.
+    """
+    first = next(iter(OBJECTIVES))
+    otherwise = f" Default: {first} for --loads, delivery for other amounts." if by_amount else ""
     return click.option(
         "--objective",
         type=NameOrReference("objective", OBJECTIVES),
-        default=next(iter(OBJECTIVES)),
-        show_default=True,
+        default=None if by_amount else first,
+        show_default=not by_amount,
         help=f"{purpose}: {', '.join(OBJECTIVES)}, or package.module:Name of an objective of your "
-        f"own.",
+        f"own.{otherwise}",
     )
 
 

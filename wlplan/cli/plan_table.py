@@ -67,6 +67,11 @@ def print_plan(document: Mapping[str, Any]) -> None:
                 f"{title}: predicted {predicted[q]:.1f} {unit}, simulated {simulated:.1f} {unit}, "
                 f"difference {off:+.1f} %"
             )
+    for number, truck in enumerate(document.get("trucks", []), start=1):
+        passes = len(truck["loads"])
+        of = f" of {truck['payload']:g} t" if "payload" in truck else ""
+        print(f"truck {number}: {truck['mass']:.1f} t{of} in {passes} load{'s'[: passes > 1]}")
+    print(_times(total))
     costs = [f"{part} {total[part]['cost']:.3f}" for part in total if "cost" in total[part]]
     print(f"cost for {document['objective']}: {', '.join(costs)}")
     lost = ledger["volume_before"] - ledger["volume_after"]
@@ -80,3 +85,16 @@ def print_plan(document: Mapping[str, Any]) -> None:
             f"avalanches: at most {solves['most_rounds']} rounds, steepest slope left "
             f"{solves['steepest_slope_deg']:.1f}°"
         )
+
+
+def _times(total: Mapping[str, Any]) -> str:
+    """How long the job takes, and what it moves an hour."""
+    digging, transport = total["simulated"]["time"], total["transport"]
+    wait = transport.get("wait", 0.0)
+    whole = digging + transport["time"] + wait
+    waiting = f", {wait:.0f} s of waiting for trucks" if wait else ""
+    rate = 3600.0 * total["simulated"]["mass"] / whole if whole else 0.0
+    return (
+        f"whole job: {whole / 60.0:.1f} min, {digging:.0f} s of digging, {transport['time']:.0f} s "
+        f"of transport{waiting}; {rate:.0f} t/h"
+    )

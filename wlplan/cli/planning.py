@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from wlplan.cli.amount import amount_options
 from wlplan.cli.inputs import (
     check_models,
     check_pile_name,
@@ -24,7 +25,6 @@ from wlplan.cli.inputs import (
 from wlplan.cli.options import (
     PileFile,
     engine_option,
-    loads_option,
     model_options,
     objective_option,
     out_option,
@@ -42,10 +42,12 @@ from wlplan.constants import QUANTITIES
 from wlplan.planning.objectives import OBJECTIVES
 
 if TYPE_CHECKING:
+    from wlplan.planning.amounts import Amount
     from wlplan.site.frame import Frame
     from wlplan.types import Performance
 
-_MOST_LOADS = 500
+# Exit code after Ctrl-C, also if there was a plan to show.
+_INTERRUPTED = 130
 # What a plan says about where it comes from; kept when it is played again.
 _ORIGIN_FIELDS = ("world", "model", "pile_state", "planner", "seed")
 
@@ -56,10 +58,10 @@ _ORIGIN_FIELDS = ("world", "model", "pile_state", "planner", "seed")
 )
 @pile_argument()
 @with_options(
-    loads_option(default=15, most=_MOST_LOADS),
+    amount_options,
     world_option,
     planner_option,
-    objective_option("What the plan minimises"),
+    objective_option("What the plan minimises", by_amount=True),
     click.option(
         "--referee/--no-referee",
         default=True,
@@ -73,10 +75,10 @@ _ORIGIN_FIELDS = ("world", "model", "pile_state", "planner", "seed")
 )
 def plan(
     pile_file: PileFile,
-    loads: int,
+    amount: Callable[[], Amount],
     world_name: str,
     planner: str,
-    objective: str,
+    objective: str | None,
     referee: bool,
     truck: tuple[float, ...] | None,
     soil: str | None,
@@ -90,6 +92,8 @@ def plan(
     """Plan the next loads from PILE and play the plan in the simulator.
 
     With --out: plan.json, plan.png, totals.png and report.html, which shows everything.
+
+    Ctrl-C ends the search: the best plan so far is played, shown and written.
     """
     check_pile_name(pile_file.name)
     check_models(model, pile_state, world_name)
@@ -105,6 +109,8 @@ def plan(
     pile = named.pile
     world = world_named(world_name, site, model, pile_state)
     simulator = world_named("simulator", site)
+    wanted = amount()
+    objective = wanted.objective if objective is None else objective
     goal = objective_of(objective_named(objective))
     chosen = planner_named(planner)
     in_simulator = world_name == "simulator"
@@ -115,7 +121,7 @@ def plan(
                 plan_loads(
                     world,
                     pile,
-                    loads=loads,
+                    amount=wanted,
                     objective=goal,
                     planner=chosen,
                     site=place,
@@ -129,7 +135,9 @@ def plan(
             simulated = planned.refereed or planned
             if planned.refereed is None and not in_simulator:
                 progress("simulator", 0, 1, None)
-                simulated = ready(play(simulator, pile, planned.plan, objective=goal, site=place))
+                simulated = ready(
+                    play(simulator, pile, planned.plan, objective=goal, amount=wanted, site=place)
+                )
                 progress("simulator", 1, 1, None)
 
     document = plan_document(
@@ -138,6 +146,8 @@ def plan(
         site=place,
         predicted=planned.rollout.performance,
         predicted_cost=float(planned.cost),
+        amount=wanted,
+        stopped=planned.stopped,
         seen=getattr(world, "faces_seen", None),
         pile=named.fields,
         **site.fields(),
@@ -171,10 +181,12 @@ def plan(
         remark(f"{name} is violated by load {', '.join(map(str, numbers))}")
     if as_json:
         click.echo(text)
-        return
-    print_plan(document)
-    print("; ".join(f"{name} {text}" for name, text in seconds.items()))
-    _print_written(folder, written)
+    else:
+        print_plan(document)
+        print("; ".join(f"{name} {text}" for name, text in seconds.items()))
+        _print_written(folder, written)
+    if planned.stopped == "interrupted":
+        raise SystemExit(_INTERRUPTED)
 
 
 def _print_written(folder: Path | None, written: list[str] | None) -> None:
@@ -219,6 +231,7 @@ def simulate(
     from wlplan.io import read_plan
     from wlplan.io.files import atomic_folder
     from wlplan.io.files import named as named_file
+    from wlplan.planning.amounts import amount_recorded
     from wlplan.planning.plan import play
     from wlplan.report.document import plan_document, write_plan_folder
     from wlplan.site.frame import frame_recorded
@@ -247,6 +260,8 @@ def simulate(
     # A plan file must not make us import somebody else's module.
     objective = objective if objective in OBJECTIVES else next(iter(OBJECTIVES))
     place = site.with_receiver(named, truck if truck is not None else _truck_of(given, frame))
+    with named_file(Path(plan_file)):
+        amount = amount_recorded(given.get("job"))
     cycles: list[Any] = []
     count = len(given["loads"])
     with Progress() as progress, Stopwatch() as playing:
@@ -262,6 +277,7 @@ def simulate(
                 pile,
                 loading_plan,
                 objective=objective,
+                amount=amount,
                 site=place,
                 note=remark,
                 record=keep,
@@ -278,6 +294,7 @@ def simulate(
         site=place,
         predicted=predicted,
         predicted_cost=None if predicted is None else _predicted_cost(given),
+        amount=amount,
         pile=named.fields,
         **site.fields(),
         **{name: given[name] for name in _ORIGIN_FIELDS if name in given},

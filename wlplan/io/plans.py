@@ -10,7 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.errors import InputError, one_line
@@ -139,8 +141,32 @@ def _parse_plan(text: str) -> tuple[LoadingPlan, dict[str, Any]]:
     plan = LoadingPlan(
         pose=Pose(*(floats(column) for column in np.array(poses).T)),
         action=Action(*(floats(column) for column in actions_in_box.T)),
+        truck=_trucks_of(document, len(loads)),
     )
     return plan, document
+
+
+def _trucks_of(document: Mapping[str, Any], count: int) -> Array | None:
+    """The truck of each load; None if the plan names no trucks.
+
+    Raises:
+        InputError: If some load goes to no truck or to several, or trucks are not filled in turn.
+    """
+    trucks = document.get("trucks")
+    if trucks is None:
+        return None
+    wrong = InputError("`trucks` does not say in turn which loads, counted from 0, each is given.")
+    if not isinstance(trucks, list):
+        raise wrong
+    given: list[Any] = []
+    for truck in trucks:
+        loads = _member(truck, "loads", "a truck")
+        if not isinstance(loads, list):
+            raise wrong
+        given.append(loads)
+    if [load for loads in given for load in loads] != list(range(count)):
+        raise wrong
+    return jnp.asarray(np.repeat(np.arange(len(given)), [len(loads) for loads in given]))
 
 
 def _member(record: Any, name: str, where: str) -> Any:

@@ -6,16 +6,20 @@ done. Its numbers are leaves, so that what is compiled for 24 t serves 30 t.
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, ClassVar, NamedTuple, no_type_check
 
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from wlplan.constants import KG_PER_TONNE
 from wlplan.errors import InputError
 from wlplan.site.site import Site
+from wlplan.site.soil import Soil
+from wlplan.types import Pile
 
 MISFIT_COST = 10.0
 """Cost of a tonne that a truck carries too much or too little; a typical loading costs 2 to 4."""
@@ -24,6 +28,8 @@ MISFIT_COST = 10.0
 _OVERLOAD_COST = 100.0
 # Smallest load that a bucket can be made to take, as a part of a typical one. Estimate.
 _SMALLEST = 0.35
+# Loads that are planned as one, about, and rows of such a plan: a third more.
+_LOADS_AT_ONCE, _ROWS = 12, 16
 # Passes that are considered to fill what is left of a truck.
 _PASSES = 16
 
@@ -42,6 +48,14 @@ def nothing_done(dtype: Any) -> Done:
     """Before the first load."""
     none, nothing = jnp.zeros((), jnp.int32), jnp.zeros((), dtype)
     return Done(none, nothing, none, nothing)
+
+
+class Made(NamedTuple):
+    """What was made so far, on the host."""
+
+    loads: int = 0
+    mass: float = 0.0  # [tonne]
+    trucks: int = 0  # that have left
 
 
 class Outlook(NamedTuple):
@@ -66,15 +80,32 @@ class Step(NamedTuple):
 
 @no_type_check
 class Amount(struct.PyTreeNode):
-    """A number of loads; the other amounts differ in what they override."""
+    """How much is to be loaded; kinds of amounts override what differs."""
 
-    def rows(self, typical: float) -> int:
-        """Rows of a plan: the most loads that it takes.
+    # What a plan is to minimise if nobody says.
+    objective: ClassVar[str] = "delivery"
+
+    def of(self, pile: Pile, soil: Soil) -> Amount:
+        """The amount for a pile, where it depends on it."""
+        del pile, soil
+        return self
+
+    def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
+        """What is to be planned next as one, and rows of a plan for it: the most loads it takes.
 
         Args:
+            made: What was made so far.
             typical: Load of a typical bucket [tonne].
+
+        Returns:
+            None when nothing is left.
         """
         raise NotImplementedError
+
+    def is_worth(self, mass: float) -> bool:
+        """Whether a load [tonne] is made at all."""
+        del mass
+        return True
 
     def is_done(self, done: Done) -> Bool[Array, ""]:
         """Whether no further load is wanted."""
@@ -97,6 +128,10 @@ class Amount(struct.PyTreeNode):
         """What is not done when a plan ends [tonne]."""
         return jnp.zeros_like(done.mass)
 
+    def rest(self, done: Done) -> Float[Array, ""]:
+        """What a plan that ends here costs beside its loads."""
+        return MISFIT_COST * self.missing(done)
+
     def to_go(self, done: Done, outlook: Outlook) -> Float[Array, ""]:
         """Cost of what is left, with loads as they are now; comparable at one point of a job."""
         del outlook
@@ -112,12 +147,13 @@ class Amount(struct.PyTreeNode):
 class Loads(Amount):
     """So many loads, whatever they hold."""
 
+    objective: ClassVar[str] = "efficiency"
     count: int = struct.field(pytree_node=False)
 
-    def rows(self, typical: float) -> int:
-        """The loads."""
+    def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
+        """All of them."""
         del typical
-        return self.count
+        return None if made.loads else (self, self.count)
 
     def is_done(self, done: Done) -> Bool[Array, ""]:
         """Once all are made."""
@@ -128,11 +164,20 @@ class Loads(Amount):
 class Tonnes(Amount):
     """As many loads as it takes to move so much."""
 
-    mass: Float[Array, ""]  # [tonne]
+    mass: float | Array  # [tonne]
+    # Whether this is part of more, and what a tonne of that costs.
+    follows: bool | Array = False
+    price: float | Array = 0.0
 
-    def rows(self, typical: float) -> int:
-        """A third more than with typical loads."""
-        return max(1, math.ceil(1.33 * float(self.mass) / typical))
+    def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
+        """A dozen loads."""
+        left, at_once = float(self.mass) - made.mass, _LOADS_AT_ONCE * typical
+        if left <= 0.0:
+            return None
+        # The last part is no small rest.
+        follows = left > 1.25 * at_once
+        mass = at_once if follows else left
+        return self.replace(mass=mass, follows=follows), _ROWS
 
     def is_done(self, done: Done) -> Bool[Array, ""]:
         """Once it is moved."""
@@ -142,31 +187,77 @@ class Tonnes(Amount):
         """What is not moved yet [tonne]."""
         return jnp.maximum(self.mass - done.mass, 0.0)
 
+    def rest(self, done: Done) -> Float[Array, ""]:
+        """Of a part: what is done too little or too much is done more or less in the next."""
+        next_part = self.price * (self.mass - done.mass)
+        return jnp.where(self.follows, next_part, MISFIT_COST * self.missing(done))
+
     def to_go(self, done: Done, outlook: Outlook) -> Float[Array, ""]:
         """By the tonne, and at the end by the bucket: the last is made whatever it holds."""
         rest = self.mass - done.mass
         by_bucket = _by_passes(rest, 3, outlook).min()
         by_tonne = outlook.cost / outlook.mass * rest
-        by_load = jnp.where(rest > 2.0 * outlook.mass, by_tonne, by_bucket)
+        many = self.follows | (rest > 2.0 * outlook.mass)
+        by_load = jnp.where(many, by_tonne, by_bucket)
         return jnp.where(outlook.price > 0.0, outlook.price * rest, by_load)
+
+
+@no_type_check
+class Empty(Amount):
+    """All of a pile but a part of its volume, as long as loads are worth it."""
+
+    remaining: float | Array = 0.02  # of the volume
+    # Least load that is made [tonne]. Estimate: what is less takes longer to fetch than to leave.
+    least: float | Array = 0.8
+
+    def of(self, pile: Pile, soil: Soil) -> Amount:
+        """The mass by the volume of the pile."""
+        above = np.maximum(np.asarray(pile.height - pile.floor, np.float64), 0.0)
+        mass = float(above.sum()) * pile.cell_size**2 * soil.density / KG_PER_TONNE
+        return Emptying(mass=(1.0 - float(self.remaining)) * mass, least=float(self.least))
+
+
+@no_type_check
+class Emptying(Tonnes):
+    """`Empty` of a pile that is known."""
+
+    least: float | Array = 0.8
+
+    def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
+        """A dozen loads, counted by the tonne: the end is where loads are not worth it."""
+        found = super().part(made, typical)
+        return found and (found[0].replace(follows=True), found[1])
+
+    def is_worth(self, mass: float) -> bool:
+        """Whether it is more than the least."""
+        return mass >= float(self.least)
 
 
 @no_type_check
 class Trucks(Amount):
     """So many trucks, each filled with whole buckets to its payload."""
 
-    count: Int[Array, ""]
-    payload: Float[Array, ""]  # [tonne]
+    count: int | Array
+    payload: float | Array  # [tonne]
     # How long the loader stands still between two trucks [s].
-    exchange: Float[Array, ""] = 30.0  # type: ignore[assignment]
-    # By how much the load may be off, and what it must never be over, as parts of the payload.
-    # Practice: 10-10-20 rules of truck makers, and site rules that are tighter on average loads.
-    tolerance: Float[Array, ""] = 0.05  # type: ignore[assignment]
-    limit: Float[Array, ""] = 1.10  # type: ignore[assignment]
+    exchange: float | Array = 30.0
+    # By how much the load may be off, and what it must never be over, as parts of the payload:
+    # the rules of many sites. Truck makers let one load in ten be over 110 %.
+    tolerance: float | Array = 0.05
+    limit: float | Array = 1.10
+    # Trucks that come after these.
+    follows: int | Array = 0
 
-    def rows(self, typical: float) -> int:
-        """For each truck two passes more than with typical loads."""
-        return int(self.count) * (math.ceil(float(self.payload) / typical) + 2)
+    def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
+        """As many trucks as a dozen loads fill, at least one."""
+        left = int(self.count) - made.trucks
+        if left <= 0:
+            return None
+        passes = math.ceil(float(self.payload) / typical)
+        at_once = max(1, _LOADS_AT_ONCE // passes)
+        rows = max(_ROWS, passes + _ROWS - _LOADS_AT_ONCE)
+        # The wait for the truck after the last of this part is part of it.
+        return self.replace(count=min(at_once, left), follows=int(at_once < left)), rows
 
     def is_done(self, done: Done) -> Bool[Array, ""]:
         """Once all have left."""
@@ -181,7 +272,7 @@ class Trucks(Amount):
         nothing = jnp.zeros_like(mass)
         trucks = done.trucks + leaves
         after = Done(done.loads + 1, done.mass + mass, trucks, jnp.where(leaves, 0.0, aboard))
-        another = leaves & (trucks < self.count)
+        another = leaves & (trucks < self.count + self.follows)
         return Step(
             after,
             jnp.where(another, self.exchange, nothing),
@@ -246,7 +337,55 @@ def check_amount(amount: Amount) -> None:
         if amount.count < 1:
             raise InputError(f"{amount.count} loads were asked for: ask for at least 1.")
         return
-    numbers = {name: float(getattr(amount, name)) for name in amount.__dataclass_fields__}
+    numbers = {
+        field.name: float(getattr(amount, field.name)) for field in dataclasses.fields(amount)
+    }
+    if isinstance(amount, Empty):
+        if not 0.0 <= numbers["remaining"] < 1.0:
+            raise InputError(f"{numbers['remaining']:g} of the pile is to remain: give a part.")
+        return
     for name, value in numbers.items():
-        if not 0.0 < value < 1e9 and not (name in ("exchange", "tolerance") and value == 0.0):
-            raise InputError(f"{name} is {value:g}: it has to be positive.")
+        may_be_nothing = name in ("exchange", "tolerance", "follows", "price")
+        if not (0.0 < value < 1e9 or (may_be_nothing and value == 0.0)):
+            raise InputError(f"the {name} of an amount is {value:g}: it has to be positive.")
+    if isinstance(amount, Trucks) and numbers["limit"] < 1.0 + numbers["tolerance"]:
+        raise InputError("trucks may be over their payload by less than the tolerance allows.")
+
+
+AMOUNTS: dict[str, tuple[type[Amount], tuple[str, ...]]] = {
+    "loads": (Loads, ("count",)),
+    "tonnes": (Tonnes, ("mass",)),
+    "trucks": (Trucks, ("count", "payload", "exchange", "tolerance", "limit")),
+    "empty": (Empty, ("remaining", "least")),
+}
+"""Amounts by the name that plan.json has for them, and what each is given by."""
+
+
+def amount_fields(amount: Amount) -> dict[str, Any]:
+    """What plan.json says about an amount, as `amount_recorded` reads it."""
+    for name, (kind, given) in AMOUNTS.items():
+        if type(amount) is kind:
+            return {"amount": name} | {
+                key: np.asarray(getattr(amount, key)).item() for key in given
+            }
+    return {"amount": type(amount).__name__}
+
+
+def amount_recorded(record: object) -> Amount | None:
+    """The amount that a plan.json records; None if it records none that can be read.
+
+    Raises:
+        InputError: If it makes no sense.
+    """
+    if not isinstance(record, dict) or record.get("amount") not in AMOUNTS:
+        return None
+    kind, given = AMOUNTS[record["amount"]]
+    numbers = {name: record[name] for name in given if name in record}
+    if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in numbers.values()):
+        return None
+    try:
+        amount = kind(**numbers)
+    except TypeError:
+        return None
+    check_amount(amount)
+    return amount

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from wlplan.actions import spread_actions
 from wlplan.planning.amounts import Outlook, Trucks
 from wlplan.planning.descent import descend
-from wlplan.planning.job import Decisions, Job, Standing, can_refine, contour_length
+from wlplan.planning.job import Decisions, Job, Standing, beginning, can_refine, contour_length
 from wlplan.planning.search import Cusps
 from wlplan.planning.stepping import cusps_of_next, next_load, score_of, score_of_next
 from wlplan.planning.watch import Watch
@@ -167,6 +167,13 @@ class LoadSearch:
         found = _costs_of_portions((job, standing, actions), parts)
         costs, masses = (np.asarray(leaf).reshape(-1, len(actions))[:count] for leaf in found)
         return np.nan_to_num(costs, nan=np.inf, posinf=np.inf), masses
+
+
+def price_of(job: Job, seed: int, watch: Watch) -> float:
+    """What a tonne costs at least, as the pile is."""
+    tried = LoadSearch().attempt(job, beginning(job), np.random.default_rng(seed), watch)
+    cost, mass = _cheapest(tried.costs, tried.masses)
+    return cost / mass
 
 
 # Scores are computed in multiples of so many.

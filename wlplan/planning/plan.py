@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
 import jax
@@ -12,11 +12,19 @@ import numpy as np
 from wlplan.checks import check_plan
 from wlplan.errors import InputError
 from wlplan.planning import planners
-from wlplan.planning.amounts import Amount, Loads, typical_load
+from wlplan.planning.amounts import Amount, Loads, Made, Tonnes, Trucks, typical_load
 from wlplan.planning.job import Decisions, Job, Standing, beginning, make_job, with_toe
+from wlplan.planning.load_search import price_of
 from wlplan.planning.objective import Objective
-from wlplan.planning.playing import PlanResult, assemble, assess, leaves_after, outcomes
-from wlplan.planning.proposals import Planner, Progress, Proposals
+from wlplan.planning.playing import (
+    PlanResult,
+    assemble,
+    assess,
+    joined,
+    leaves_after,
+    outcomes,
+)
+from wlplan.planning.proposals import NothingWorthIt, Planner, Progress, Proposals
 from wlplan.planning.watch import BudgetSpent, Watch
 from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour
@@ -79,31 +87,73 @@ def plan_loads(
     elif loads is not None:
         raise InputError("both loads and an amount are given: give one of them.")
     if objective is None:
-        objective = "efficiency" if isinstance(amount, Loads) else "delivery"
-    job = with_toe(
-        make_job(world, pile, site=site, objective=objective, amount=amount, contour=contour),
-        contour,
-    )
+        objective = amount.objective
+    amount = amount.of(pile, (Site() if site is None else site).soil)
+    job = make_job(world, pile, site=site, objective=objective, amount=amount, contour=contour)
+    checked = None
+    if referee is not None:
+        checked = make_job(referee, pile, site=job.site, contour=contour).world
     chosen = planner_of(planner, job.world)
-    rows = amount.rows(typical_load(job.site))
-    watch, stopped = Watch(progress, budget), ""
+    watch, made = Watch(progress, budget), Made()
+    parts: list[PlanResult] = []
+    typical = typical_load(job.site)
+    while not watch.stopped and (part := amount.part(made, typical)) is not None:
+        try:
+            of_part = with_toe(job.replace(amount=part[0]), None if parts else contour)
+            if isinstance(part[0], Tonnes):
+                # Until loads were planned, by those that could be made.
+                price = _price(parts) if parts else price_of(of_part, seed, watch)
+                of_part = of_part.replace(amount=part[0].replace(price=price))
+            proposals = _proposals(chosen, of_part, part[1], seed + len(parts), watch)
+        except (InputError, NothingWorthIt):
+            # Of what was planned already, nothing is lost.
+            if not parts:
+                raise
+            break
+        if proposals is None:
+            break
+        result = choose(of_part, proposals, referee=checked)
+        parts.append(result)
+        after = (result.refereed or result).rollout.pile
+        # What is planned next is planned on the pile as the referee has it by then.
+        job = job.replace(pile=after)
+        made = _made_with(made, result)
+        if not len(result.costs):
+            break
+    if not parts:
+        raise (
+            KeyboardInterrupt
+            if watch.stopped == "interrupted"
+            else InputError(f"a budget of {budget:g} loadings is too small for a first plan.")
+        )
+    return joined(parts).replace(spent=watch.spent, stopped=watch.stopped)
+
+
+def _proposals(planner: Planner, job: Job, rows: int, seed: int, watch: Watch) -> Proposals | None:
+    """What a planner proposes, or the best it had when it was stopped; None if there was none."""
+    watch.best = None
     try:
-        proposals = chosen.propose(job, rows, seed=seed, progress=watch)
-    except (KeyboardInterrupt, BudgetSpent) as error:
-        if watch.best is None:
-            if isinstance(error, BudgetSpent):
-                raise InputError(
-                    f"a budget of {budget:g} loadings is too small for a first plan."
-                ) from None
-            raise
-        proposals = Proposals(watch.best.plan)
-        stopped = "budget" if isinstance(error, BudgetSpent) else "interrupted"
-    if referee is None:
-        result = choose(job, proposals)
-    else:
-        checked = make_job(referee, pile, site=job.site, contour=contour)
-        result = choose(job, proposals, referee=checked.world)
-    return result.replace(spent=watch.spent, stopped=stopped)
+        return planner.propose(job, rows, seed=seed, progress=watch)
+    except BudgetSpent:
+        watch.stopped = "budget"
+    except KeyboardInterrupt:
+        watch.stopped = "interrupted"
+        if watch.best is not None:
+            watch("best so far", 0, 1, None)
+    return None if watch.best is None else Proposals(watch.best.plan)
+
+
+def _price(parts: Sequence[PlanResult]) -> float:
+    """What a tonne has cost so far."""
+    cost = sum(float(part.costs.sum()) for part in parts)
+    return cost / sum(float(part.rollout.performance.mass.sum()) for part in parts)
+
+
+def _made_with(made: Made, result: PlanResult) -> Made:
+    truck = result.plan.truck
+    trucks = 0 if truck is None else int(np.max(np.asarray(truck), initial=-1)) + 1
+    mass = float(result.rollout.performance.mass.sum())
+    return Made(made.loads + len(result.costs), made.mass + mass, made.trucks + trucks)
 
 
 def planner_of(planner: str | Planner, world: World) -> Planner:
@@ -176,9 +226,9 @@ def _made(job: Job, result: PlanResult) -> PlanResult:
     }
     performance = jax.tree.map(lambda leaf: leaf[rows], result.rollout.performance)
     made = result.replace(rollout=result.rollout.replace(performance=performance), **of_loads)
-    if isinstance(job.amount, Loads):
-        return made.replace(plan=made.plan.replace(truck=None))
-    return made
+    if isinstance(job.amount, Trucks):
+        return made
+    return made.replace(plan=made.plan.replace(truck=None))
 
 
 def _rows(proposals: Proposals) -> Decisions | LoadingPlan:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
@@ -123,7 +124,7 @@ def assemble(
         terms=loadings.terms,
         misfit=loadings.misfit,
         costs=loadings.cost,
-        cost=loadings.cost.sum() + MISFIT_COST * missing,
+        cost=loadings.cost.sum() + job.amount.rest(last.done),
         missing=missing,
         faces=loadings.face,
         ways=loadings.ways,
@@ -208,3 +209,35 @@ costs_and_gradients = ParallelMap(_cost_and_gradient)
 """`costs_and_gradients(job, (candidates, cusps))`: cost of several plans, leaves [K, N], and
 gradient, which has no trucks. The ways keep their cusps, which move with the poses: so a descent is
 smooth, and fast."""
+
+
+def joined(parts: Sequence[PlanResult]) -> PlanResult:
+    """Results that follow each other as one; trucks are counted on."""
+    if len(parts) == 1:
+        return parts[0]
+    plans, first = [], 0
+    for part in parts:
+        plan = part.plan
+        if plan.truck is not None:
+            plan = plan.replace(truck=plan.truck + first)
+            first += int(np.max(np.asarray(part.plan.truck), initial=-1)) + 1
+        plans.append(plan)
+
+    def together(*leaves: Any) -> Array:
+        return jnp.concatenate([jnp.atleast_1d(leaf) for leaf in leaves])
+
+    names = ("transport", "terms", "misfit", "costs", "faces", "ways", "solves")
+    of_loads = {
+        name: jax.tree.map(together, *(getattr(part, name) for part in parts)) for name in names
+    }
+    performance = jax.tree.map(together, *(part.rollout.performance for part in parts))
+    seen = [part.refereed for part in parts if part.refereed is not None]
+    last = parts[-1]
+    return last.replace(
+        plan=jax.tree.map(together, *plans),
+        rollout=last.rollout.replace(performance=performance),
+        # What is missing of one part is made up for in the next.
+        cost=sum(part.costs.sum() for part in parts) + MISFIT_COST * last.missing,
+        refereed=joined(seen) if seen else None,
+        **of_loads,
+    )

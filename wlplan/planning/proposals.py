@@ -12,6 +12,10 @@ Progress = Callable[[str, int, int, float | None], None]
 """`progress(stage, done, total, cost)`, called as a planner advances."""
 
 
+class NothingWorthIt(Exception):  # noqa: N818
+    """No load that is left is worth making, which is no error."""
+
+
 class Proposals(NamedTuple):
     """The plans that a planner hands over, for the world or a referee to pick from.
 

@@ -40,12 +40,14 @@ class Watch:
     Attributes:
         spent: Loadings evaluated so far.
         best: The best plan so far; None before there is one.
+        stopped: What ended the search early: "", "budget" or "interrupted".
     """
 
     def __init__(self, progress: Progress | None = None, budget: float | None = None):
         self._progress, self._budget = progress, budget
         self.spent = 0.0
         self.best: Best | None = None
+        self.stopped = ""
 
     def __call__(self, stage: str, done: int, total: int, cost: float | None) -> None:
         """How far a stage is, as `Progress`."""

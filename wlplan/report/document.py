@@ -13,6 +13,7 @@ import numpy as np
 
 from wlplan.constants import KG_PER_TONNE, QUANTITIES
 from wlplan.io.plans import plan_to_dict
+from wlplan.planning.amounts import Amount, Trucks, amount_fields
 from wlplan.planning.clearance import clearance
 from wlplan.planning.playing import PlanResult
 from wlplan.planning.way import points_of
@@ -40,6 +41,8 @@ def plan_document(
     site: Site,
     predicted: Performance | None = None,
     predicted_cost: float | None = None,
+    amount: Amount | None = None,
+    stopped: str = "",
     seen: tuple[Characteristics, Characteristics] | None = None,
     **origin: Any,
 ) -> dict[str, Any]:
@@ -51,6 +54,8 @@ def plan_document(
         site: Where: its receiver, its frame, and its soil, whose density closes the ledger.
         predicted: What the world that planned foresaw, leaves [N]; None: nothing is known of it.
         predicted_cost: Cost of the plan in that world.
+        amount: How much was to be loaded.
+        stopped: What ended the search for the plan early, see `PlanResult`.
         seen: The least and the largest characteristics of faces that it was trained on.
         **origin: Further top-level fields: pile, soil, machine, world, planner, objective, seed.
     """
@@ -61,11 +66,19 @@ def plan_document(
             "work": _sum(simulated.transport.work),
         },
     }
+    wait = np.asarray(simulated.transport.wait, np.float64)
+    if wait.any():
+        total["transport"]["wait"] = float(wait.sum())
     if predicted is not None:
         total = {"predicted": totals(predicted, predicted_cost), **total}
     ways: dict[str, Any] = (
         {} if simulated.ways is None else {"paths": paths_of(before, simulated, site)}
     )
+    job: dict[str, Any] = {} if amount is None else {"job": amount_fields(amount)}
+    if stopped:
+        job["stopped"] = stopped
+    if simulated.plan.truck is not None:
+        job["trucks"] = trucks_of(simulated, site, amount)
     document = plan_to_dict(
         simulated.plan,
         **ways,
@@ -73,6 +86,7 @@ def plan_document(
         simulated=simulated.rollout.performance,
         transport={"time": simulated.transport.time, "work": simulated.transport.work},
         **origin,
+        **job,
         frame=site.frame.fields(),
         receiver=receiver_fields(site.placed_receiver),
         total=total,
@@ -80,6 +94,28 @@ def plan_document(
     )
     notes = remarks_on(document, before, site, faces=simulated.faces, seen=seen)
     return {**document, "notes": notes}
+
+
+def trucks_of(played: PlanResult, site: Site, amount: Amount | None) -> list[dict[str, Any]]:
+    """What plan.json says about trucks: payload and mass [tonne], loads counted from 0, place.
+
+    Args:
+        played: The plan as it was played; it says which truck each load goes to.
+        site: With its receiver, which is where the place is said.
+        amount: What was to be loaded, with the payload.
+    """
+    truck = np.asarray(played.plan.truck)
+    mass = np.asarray(played.rollout.performance.mass, np.float64)
+    payload = {"payload": float(amount.payload)} if isinstance(amount, Trucks) else {}
+    return [
+        {
+            **payload,
+            "mass": float(mass[truck == number].sum()),
+            "loads": np.flatnonzero(truck == number).tolist(),
+            **receiver_fields(site.placed_receiver),
+        }
+        for number in range(int(truck.max(initial=-1)) + 1)
+    ]
 
 
 def paths_of(before: Pile, played: PlanResult, site: Site) -> list[dict[str, Any]]:

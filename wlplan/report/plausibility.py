@@ -47,6 +47,8 @@ def remarks_on(
     """
     loads = document["loads"]
     return [
+        *_stopped(document),
+        *_trucks(document),
         *_empty(loads),
         *_far_off(loads),
         *_new_faces(faces, seen),
@@ -55,6 +57,31 @@ def remarks_on(
         *_truck(pile, site, site.frame),
         *_steep(pile, site),
     ]
+
+
+def _stopped(document: Mapping[str, Any]) -> list[str]:
+    by = {"budget": "by its budget", "interrupted": "by hand"}.get(document.get("stopped", ""))
+    return [] if by is None else [f"the search was ended early, {by}: this is the best by then"]
+
+
+def _trucks(document: Mapping[str, Any]) -> list[str]:
+    job, trucks = document.get("job") or {}, document.get("trucks") or []
+    found = []
+    for sign, what in ((-1.0, "less"), (1.0, "more")):
+        part = 1.0 + sign * job.get("tolerance", 0.0)
+        off = [
+            (number, truck["mass"])
+            for number, truck in enumerate(trucks, start=1)
+            if "payload" in truck and sign * (truck["mass"] - part * truck["payload"]) > 5e-4
+        ]
+        if off:
+            names = ", ".join(f"{number} ({mass:.1f} t)" for number, mass in off)
+            one = f"truck {names} carries" if len(off) == 1 else f"trucks {names} carry"
+            found.append(f"{one} {what} than {100.0 * part:.0f} % of the payload")
+    missing = job.get("count", 0) - len(trucks) if trucks else 0
+    if missing > 0:
+        found.append(f"{missing} of {job['count']} trucks are not filled")
+    return found
 
 
 def _empty(loads: Sequence[Mapping[str, Any]]) -> list[str]:

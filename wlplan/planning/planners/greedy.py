@@ -11,7 +11,7 @@ import numpy as np
 from wlplan.planning.amounts import Loads, Trucks
 from wlplan.planning.job import Job, beginning, padded, stacked
 from wlplan.planning.load_search import LoadSearch
-from wlplan.planning.proposals import Progress, Proposals
+from wlplan.planning.proposals import NothingWorthIt, Progress, Proposals
 from wlplan.planning.stepping import advance
 from wlplan.planning.watch import watching
 
@@ -45,13 +45,18 @@ class Greedy(LoadSearch):
             found = self.best(job, standing, tried, outlook, watch)
             best = int(np.argmin(found.scores))
             decision = jax.tree.map(lambda leaf, b=best: leaf[b], found.decisions)
-            standing, truck = _advance(job, standing, decision, outlook)
+            after, truck = _advance(job, standing, decision, outlook)
+            if not job.amount.is_worth(float(after.done.mass - standing.done.mass)):
+                break
+            standing = after
             chosen.append(decision.replace(truck=truck))
             watch.keep(padded(chosen, loads), -math.inf)
             watch("greedy", load + 1, loads, float(found.scores[best]))
             watch.spend(1)
             if job.amount.is_done(standing.done):
                 break
+        if not chosen:
+            raise NothingWorthIt
         plan = stacked(chosen).replace(truck=None)
         if not isinstance(job.amount, Loads):
             plan = padded(chosen, loads)
