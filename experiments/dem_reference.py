@@ -24,7 +24,7 @@ from scipy import ndimage
 
 from experiments._common.results import main
 from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
-from wlplan.engines.simulator import STOP_REASONS, Cycle, dig, terrain
+from wlplan.engines.simulator import STOP_REASONS, Cycle, dig, terrain, walls
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
 from wlplan.site.machine import WA320
@@ -144,7 +144,8 @@ def forces(reference: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     def lead(height: Array, fill: Array, path: Array) -> tuple[Array, Array, Array]:
         def step(state: tuple[Array, Array, Array], at: Array) -> tuple[Any, Any]:
             height, fill, reach = state
-            bucket = terrain.Bucket(at[:, 0], at[:, 1], at[:, 2])
+            wall = jnp.full_like(at[:, 0], walls.NOWHERE)
+            bucket = terrain.Bucket(at[:, 0], at[:, 1], at[:, 2], wall)
             reached = jnp.maximum(reach, bucket.x)
             height, fill = terrain.move(
                 *(MACHINE, GRAVEL, height, fill, ground, bucket, (reach, reached), _STEP, wanted)

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,15 @@ from scipy import ndimage, stats
 
 from experiments.dem_reference import REFERENCE, replay
 from wlplan.constants import ACTION_HIGH, GRAVITY
-from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig, terrain
+from wlplan.engines.simulator import (
+    STOP_REASONS,
+    Settings,
+    Simulator,
+    dig,
+    terrain,
+    trace,
+    walls,
+)
 from wlplan.engines.simulator.cycle import Cycle, State, advance, begin, outcome
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, Soil
@@ -24,13 +33,19 @@ from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
 from wlplan.terrain.toe import ToeContour, toe_contour
 from wlplan.types import Action, Performance, Pile, Pose, action_from
 
-# Surfaces and actions -> their cycles.
 Rows = Sequence[npt.ArrayLike] | np.ndarray
-Digs = Callable[[Rows, Rows], Cycle]
 Played = tuple[Pile, Performance, Cycle]
 Loadings = tuple[
     Callable[..., Played], tuple[Pile, Pose, Action], Played, tuple[slice, slice, slice]
 ]
+
+
+class Digs(Protocol):
+    """Surfaces, actions and perhaps floors -> their cycles."""
+
+    def __call__(self, heights: Rows, actions: Rows, grounds: Rows | None = None) -> Cycle:
+        """One cycle a row; without floors they are level."""
+
 
 ALONG, LEFT = local_axes(52, 1.0)
 GRID = 224  # cells a side that hold any seed pile
@@ -240,27 +255,27 @@ def bumpy(seed: int, slope: float = 26.0) -> np.ndarray:
 
 
 def batched(step: float = 0.02, machine: WheelLoader = WA320, batch: int = BATCH) -> Digs:
-    """`dig` over lists of surfaces and actions, compiled for batches of one size."""
+    """`dig` over lists of surfaces, actions and floors, compiled for batches of one size."""
 
     @jax.jit
     @jax.vmap
-    def run(height: jax.Array, action: jax.Array) -> Cycle:
+    def run(height: jax.Array, ground: jax.Array, action: jax.Array) -> Cycle:
         return dig(
             height,
-            jnp.zeros_like(height),
+            ground,
             action_from(action),
             settings=Settings(step=step),
             machine=machine,
         )
 
-    def call(heights: Rows, actions: Rows) -> Cycle:
+    def call(heights: Rows, actions: Rows, grounds: Rows | None = None) -> Cycle:
         heights, actions = np.array(heights, np.float32), np.array(actions, np.float32)
+        grounds = np.zeros_like(heights) if grounds is None else np.array(grounds, np.float32)
         n = len(actions)
         assert n <= batch
         fill = np.minimum(np.arange(batch), n - 1)
-        cycle: Cycle = jax.tree.map(
-            lambda v: np.asarray(v)[:n], run(jnp.asarray(heights[fill]), jnp.asarray(actions[fill]))
-        )
+        cycles = run(*(jnp.asarray(rows[fill]) for rows in (heights, grounds, actions)))
+        cycle: Cycle = jax.tree.map(lambda v: np.asarray(v)[:n], cycles)
         return cycle
 
     return call
@@ -457,7 +472,7 @@ def met_by(
     """`terrain.reaction` against one surface, in double precision."""
     rim = terrain.rimmed(jnp.asarray(height, jnp.float64)[..., None])
     fills = jnp.full((terrain.Lanes(WA320).count, 1), fill)
-    bucket = terrain.Bucket(*(jnp.asarray([v]) for v in (x, z, tilt)))
+    bucket = terrain.Bucket(*(jnp.asarray([v]) for v in (x, z, tilt, walls.NOWHERE)))
     floor = jnp.full_like(rim, ground)
     return reaction(WA320, soil, rim, floor, fills, bucket, jnp.asarray(True))
 
@@ -529,7 +544,7 @@ def test_what_stands_over_the_side_plates_falls_beside_the_bucket(width: float) 
     lanes = terrain.Lanes(machine)
     height = terrain.rimmed(jnp.zeros((52, 52, 1)))
     full = lanes.width * machine.bucket_depth * (machine.side_height + 0.1)
-    bucket = terrain.Bucket(*(jnp.asarray([v]) for v in (2.0, 1.0, 0.3)))
+    bucket = terrain.Bucket(*(jnp.asarray([v]) for v in (2.0, 1.0, 0.3, walls.NOWHERE)))
     reach = bucket.x, bucket.x
     after, fill = jax.jit(partial(terrain.move, machine, GRAVEL, step=0.02))(
         height, jnp.asarray(full, jnp.float32), height, bucket, reach, wanted=jnp.asarray(True)
@@ -561,6 +576,159 @@ def test_cycles_advanced_in_parts_end_alike(digs: Digs) -> None:
     mass = outcome(state, machine=WA320, soil=GRAVEL).mass
     want = digs([bumpy(k) for k in range(8)], np.stack(jax.tree.leaves(action), axis=-1)).mass
     np.testing.assert_allclose(mass, want, rtol=1e-5)
+
+
+# --- Walls ahead. -------------------------------------------------------------------------------
+
+# Never lifts nor tilts; at once, a little; and the boom only.
+STUBBORN, BOOM = [0.7, 0.0, 0.7, 0.0], [0.2, 2.0, 0.7, 0.0]
+EITHER: list[npt.ArrayLike] = [STUBBORN, MODERATE, BOOM, [0.7, 0.0, 0.3, 3.0]]
+
+
+def fenced(
+    surface: np.ndarray,
+    at: float,
+    top: float = 2.5,
+    turned: float = 0.0,
+    columns: slice = slice(None),
+) -> tuple[np.ndarray, np.ndarray]:
+    """A surface with a wall of three cells across it, nothing behind it, and the ground.
+
+    Its face is `at` metres ahead, where its ramp is half as high as it is; `turned` in degrees.
+    """
+    a = math.radians(turned)
+    behind = math.cos(a) * (ALONG[:, None] - at) + math.sin(a) * LEFT[None, :]
+    rises = np.clip(behind / 0.1 + 0.5, 0.0, 1.0)
+    ground = np.zeros((52, 52))
+    ground[:, columns] = (top * rises * (behind < 0.3))[:, columns]
+    soil = np.where(behind < 0.0, surface, 0.0)
+    return np.maximum(soil, ground).astype(np.float32), ground.astype(np.float32)
+
+
+def rows_of(scenes: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[Rows, Rows]:
+    return [height for height, _ in scenes], [ground for _, ground in scenes]
+
+
+def in_front_of(scene: tuple[np.ndarray, np.ndarray], at: float) -> float:
+    """Soil before a wall that stands square to the heading [kg]."""
+    height, ground = (v.astype(np.float64) for v in scene)
+    return float((height - ground)[at - 0.05 > ALONG].sum() * 0.01 * GRAVEL.density)
+
+
+@pytest.mark.parametrize("at", [0.6, 0.95, 1.0, 1.07])
+def test_the_bucket_does_not_pass_a_wall(digs: Digs, at: float) -> None:
+    scenes = [fenced(ramp(s), at) for s in (0.0, 20.0, 30.0) for _ in EITHER]
+    heights, grounds = rows_of(scenes)
+    cycle, free = (
+        digs(rows, EITHER * 3, floors)
+        for rows, floors in (
+            (heights, grounds),
+            ([ramp(s) for s in (0.0, 20.0, 30.0) for _ in EITHER], None),
+        )
+    )
+    # On a ramp of a cell the face is known to a part of it.
+    assert (cycle.tip_x <= at + 0.02).all()
+    # A bucket that tilts draws its edge back by a little.
+    assert (cycle.tip_x >= at - 0.06).all()
+    assert (free.tip_x > at + 0.3).all()
+    assert (cycle.mass <= np.maximum(free.mass, 1e-6)).all()
+    for mass, scene in zip(cycle.mass, scenes, strict=True):
+        assert mass <= in_front_of(scene, at) + 1e-3
+    # A wall is no soil, and what lies before it is dug.
+    assert (cycle.mass[:4] == 0.0).all()
+    assert (cycle.mass[4:] > 100.0).all()
+    # It ends as every cycle does.
+    assert (cycle.fill_time <= 15.0 + 1e-3).all()
+    assert (cycle.stop_reason[::4] == STOP_REASONS.index("timeout")).all()
+    assert (cycle.stop_reason[1::4] == STOP_REASONS.index("breakout")).all()
+    np.testing.assert_allclose(cycle.fill_time[::4], 15.0, atol=1e-3)
+    for part in ("work_drive", "work_boom", "work_bucket", "work_slip"):
+        assert np.isfinite(getattr(cycle, part)).all()
+        assert (getattr(cycle, part) >= 0.0).all()
+    before, after = (np.array(h).sum((1, 2), np.float64) for h in (heights, cycle.height))
+    # Rounding goes with what stands on the map, the wall too.
+    difference = (before - after) * 0.01 * GRAVEL.density - cycle.mass
+    np.testing.assert_array_less(np.abs(difference), 5e-5 * before * 0.01 * GRAVEL.density)
+    assert (cycle.height >= np.array(grounds) - 1e-5).all()
+
+
+def test_the_edge_is_before_the_wall_all_the_time() -> None:
+    height, ground = fenced(ramp(30.0), 1.0)
+    run = jax.jit(jax.vmap(partial(trace, jnp.asarray(height), jnp.asarray(ground))))
+    path = run(action_from(jnp.asarray(np.array(EITHER, np.float32))))
+    assert (np.asarray(path.tip_x) <= 1.0 + 1e-4).all()
+    assert (np.asarray(path.tip_x).max(axis=1) >= 1.0 - 1e-4).all()
+    # Held there, the bucket lifts or tilts as its controller has it, and at the stop tilts out.
+    rising = np.diff(np.asarray(path.tip_z), axis=1)
+    assert rising.min() >= -1e-6
+    np.testing.assert_allclose(path.tilt[:, -1], WA320.tilt_end, atol=1e-3)
+
+
+def test_what_is_driven_over_is_no_wall(digs: Digs) -> None:
+    """A kerb, and a floor that rises by 10 degrees or has the noise of a scan."""
+    flat = np.zeros((52, 52), np.float32)
+    noise = np.random.default_rng(0).normal(0.0, 0.03, (52, 52))
+    floors = [fenced(flat, 1.0, 0.1)[1], ramp(10.0), noise]
+    cycle = digs(floors, [STUBBORN] * 3, floors)
+    assert (cycle.stop_reason == STOP_REASONS.index("penetration")).all()
+    soil, kerb = fenced(flat, 1.0, 0.1)
+    slope = ramp(28.0)
+    behind = [np.maximum(slope, kerb), slope, np.maximum(slope, soil)]
+    over, none, _ = digs(behind, [MODERATE] * 3, [kerb, flat, kerb]).mass
+    assert over == pytest.approx(none, rel=0.05)
+
+
+def test_a_raised_bucket_passes_what_is_lower(digs: Digs) -> None:
+    """The boom lifts the edge over 0.4 m in time; a bucket that stays down is stopped."""
+    slope = ramp(20.0)
+    low, high = (fenced(slope, 1.6, top)[1] for top in (0.4, 2.5))
+    grounds = [low, low, high]
+    cycle = digs([np.maximum(slope, g) for g in grounds], [BOOM, STUBBORN, BOOM], grounds)
+    assert cycle.tip_x[0] > 2.0
+    assert cycle.tip_z[0] > 0.4
+    np.testing.assert_allclose(cycle.tip_x[1:], 1.6, atol=0.02)
+
+
+def test_a_corner_of_the_bucket_is_enough(digs: Digs) -> None:
+    flat = np.zeros((52, 52), np.float32)
+    lanes = terrain.Lanes(WA320)
+    beside = [
+        slice(0, lanes.first),
+        slice(lanes.end, 52),
+        slice(0, lanes.first + 1),
+        slice(lanes.end - 1, 52),
+    ]
+    posts = [fenced(flat, 1.0, columns=columns) for columns in beside]
+    aslant = [fenced(flat, 2.0, turned=turned) for turned in (30.0, -30.0)]
+    heights, grounds = rows_of([*posts, *aslant])
+    cycle = digs(heights, [STUBBORN] * 6, grounds)
+    np.testing.assert_allclose(cycle.tip_x[:4], [3.2, 3.2, 1.0, 1.0], atol=0.02)
+    half = LEFT[lanes.end - 1]
+    corner = 2.0 - half * math.tan(math.radians(30.0))
+    np.testing.assert_allclose(cycle.tip_x[4:], corner, atol=0.05)
+
+
+def test_the_face_moves_with_the_pose_whatever_the_cells() -> None:
+    """Walls on a grid, seen from places a few millimetres apart, square and aslant."""
+    grid = np.zeros((120, 120), np.float32)
+    grid[75:78] = 2.5
+    pile = Pile(jnp.asarray(grid), 0.1, ground=jnp.asarray(grid))
+    lanes = terrain.Lanes(WA320)
+
+    @jax.jit
+    @jax.vmap
+    def stop(x: jax.Array, heading: jax.Array) -> jax.Array:
+        _, ground = Simulator().view(pile, Pose(x, jnp.float32(6.0), heading))
+        met = lanes.of(terrain.rimmed(ground[..., None]))
+        return walls.nearest(*walls.faces(met), jnp.zeros(1))[0]
+
+    places = np.linspace(5.5, 5.8, 61, dtype=np.float32)
+    for heading in (0.0, 0.5):
+        found = np.asarray(stop(jnp.asarray(places), jnp.full(61, heading, jnp.float32)))
+        half = LEFT[lanes.end - 1] * math.tan(heading)
+        # The face is half a cell before the first cell of the wall.
+        np.testing.assert_allclose(found, (7.45 - places) / math.cos(heading) - half, atol=0.05)
+        assert np.abs(np.diff(found)).max() < 0.03
 
 
 # --- Against the discrete elements: a guard against regressions, not a validation. --------------
@@ -670,3 +838,39 @@ def test_gradients_are_finite_where_there_is_nothing_to_dig(
 ) -> None:
     _, _, gradient, _ = derivatives
     assert np.isfinite(gradient).all()
+
+
+@pytest.mark.slow
+def test_gradients_before_a_wall_against_finite_differences() -> None:
+    """Of mass, time and work in the place of the wall, the slope and the action: it is met."""
+    with jax.enable_x64(True):
+        along = jnp.asarray(np.tile(ALONG[:, None], 52))
+
+        def outcome(vector: jax.Array, differentiable: bool) -> jax.Array:
+            behind = along - vector[0]
+            ground = 2.5 * jnp.clip(behind / 0.1 + 0.5, 0.0, 1.0)
+            soil = jnp.clip(vector[1] * along, 0.0, 4.0)
+            cycle = dig(
+                jnp.maximum(jnp.where(behind < 0.0, soil, 0.0), ground),
+                ground,
+                action_from(vector[2:]),
+                settings=Settings(differentiable=differentiable),
+            )
+            return jnp.stack([cycle.mass, cycle.time, total_work(cycle), cycle.tip_x])
+
+        points = np.array([[1.23, 0.5, *MODERATE], [1.53, 0.55, 0.25, 1.5, 0.4, 2.8]])
+        size, step = points.shape[1], 1e-6
+        gradient = np.asarray(
+            jax.jit(jax.vmap(jax.jacrev(partial(outcome, differentiable=True))))(points)
+        )
+        shifts = step * np.concatenate([np.eye(size), -np.eye(size)])
+        shifted = (points[:, None] + shifts).reshape(-1, size)
+        forward = jax.jit(jax.vmap(partial(outcome, differentiable=False)))
+        out = np.asarray(forward(jnp.asarray(shifted))).reshape(len(points), 2, size, -1)
+        central = np.moveaxis(out[:, 0] - out[:, 1], 1, 2) / (2 * step)
+    assert np.isfinite(gradient).all()
+    # The edge is where the wall is, and a wall that is further off leaves more to dig.
+    np.testing.assert_allclose(gradient[:, 3, 0], 1.0, atol=0.3)
+    assert (gradient[:, 0, 0] > 300.0).all()
+    error = np.linalg.norm((gradient - central)[:, :3], axis=-1)
+    np.testing.assert_array_less(error, 5e-3 * np.linalg.norm(central[:, :3], axis=-1))

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -323,3 +324,26 @@ def test_no_world_digs_a_wall_or_takes_soil_through_it(name: str, where: str) ->
         assert np.abs(height[beyond]).max() < 1e-5
         assert float(performance.mass) > 0.5
         assert float(jnp.abs(pile.height - before.height).max()) > 0.1
+
+
+def test_what_lies_behind_a_wall_is_not_loaded() -> None:
+    """In the simulator: a load leaves the pile whole, and is the same with soil there or none."""
+    x, y = np.meshgrid(*(CELL * np.arange(140),) * 2, indexing="ij")
+    soil = np.clip((x - 6.0) * SLOPE, 0.0, 2.4)
+    ground = np.where((x > 6.95) & (x < 7.25), 2.5, 0.0).astype(np.float32)
+    pose = Pose(*(jnp.float32(v) for v in (6.0, 7.0, 0.0)))
+    action = Action(*(jnp.float32(v) for v in (0.4, 2.0, 0.4, 2.0)))
+    world = wlplan.load_world("simulator")
+    loads = []
+    for lies in (soil, np.where(x < 7.0, soil, 0.0)):
+        pile = Pile(np.maximum(lies, ground).astype(np.float32), CELL, ground=ground)
+        _, performance, report = world.solve(pile, pose, action)  # type: ignore[attr-defined]
+        assert abs(float(report.missing)) < 0.01
+        loads.append(jax.tree.leaves(performance))
+    one, other = np.asarray(loads)
+    np.testing.assert_allclose(one, other, rtol=1e-4)
+    # Before the bucket, and beside it, from where some slides in.
+    before, around = (
+        soil[(x < 6.95) & (np.abs(y - 7.0) < half)].sum() * CELL**2 * 1.727 for half in (1.35, 1.6)
+    )
+    assert 0.8 * before < one[0] <= around

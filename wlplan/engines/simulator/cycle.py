@@ -29,7 +29,7 @@ from wlplan.engines.limits import (
     MAX_FILL_TIME,
     MAX_PENETRATION,
 )
-from wlplan.engines.simulator import controller, loader, terrain
+from wlplan.engines.simulator import controller, loader, terrain, walls
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, Soil
 from wlplan.terrain.heightmap import STATE_DISPLACEMENT
@@ -78,6 +78,8 @@ class State(struct.PyTreeNode):
     height: Float[Array, "54 54 b"]  # with its rim, see `terrain` [m]
     ground: Float[Array, "54 54 b"]  # likewise; does not change
     profile: Float[Array, "52 b"]  # surface before, across the bucket; does not change [m]
+    wall_x: Float[Array, "51 b"]  # faces of walls along the heading; do not change [m]
+    wall_top: Float[Array, "51 b"]  # how high they stand; does not change [m]
     action: Action  # does not change
     fill: Float[Array, "lanes b"]  # soil in each lane of the bucket [m^3]
     time: Float[Array, " b"]
@@ -135,9 +137,13 @@ def begin(
     travelled = machine.approach_distance - STATE_DISPLACEMENT
     rolling = machine.rolling_resistance * machine.mass * GRAVITY * travelled
     boom = zero + machine.boom_low
+    floor = terrain.rimmed(ground)
+    wall_x, wall_top = walls.faces(terrain.Lanes(machine).of(floor))
     return State(
         height=terrain.rimmed(height),
-        ground=terrain.rimmed(ground),
+        ground=floor,
+        wall_x=wall_x,
+        wall_top=wall_top,
         profile=jnp.einsum("ijb,j->ib", height, jnp.asarray(width / width.sum(), dtype)),
         action=jax.tree.map(lambda part: jnp.asarray(part, dtype), action),
         fill=jnp.zeros((terrain.Lanes(machine).count, height.shape[2]), dtype),
@@ -206,7 +212,8 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     filling = state.phase == _FILLING
     wanted = ~state.has_ended.all()
     x, z = loader.bucket_tip(machine, state.position, state.boom, state.tilt)
-    bucket = terrain.Bucket(x, z, state.tilt)
+    wall = materialize_if(walls.nearest(state.wall_x, state.wall_top, z), wanted)
+    bucket = terrain.Bucket(x, z, state.tilt, wall)
     soil_force = terrain.reaction(
         machine, soil, state.height, state.ground, state.fill, bucket, wanted
     )
@@ -214,6 +221,7 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     vertical = soil_force.vertical
 
     # Vehicle: thrust while filling, brake after the stop. The soil can stop it, not push it back.
+    # So can a wall, at once.
     total = machine.mass + soil_force.content_mass
     thrust, slip = loader.drive(machine, state.speed, vertical)
     brake = machine.traction * total * GRAVITY
@@ -223,7 +231,9 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     # What the soil must resist to bring the vehicle to rest within the step.
     stopping = jnp.maximum(thrust - passive + total * state.speed / step, 0.0)
     horizontal = jnp.minimum(soil_force.horizontal, stopping)
-    speed = jnp.maximum(state.speed + (thrust - passive - horizontal) / total * step, 0.0)
+    free = jnp.maximum(state.speed + (thrust - passive - horizontal) / total * step, 0.0)
+    speed = jnp.minimum(free, jnp.maximum(wall - x, 0.0) / step)
+    horizontal = horizontal + total * (free - speed) / step
 
     # Controller and actuators.
     force = loader.boom_force(machine, state.boom, vertical, horizontal)
@@ -244,6 +254,9 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     tilt = state.tilt + tilt_rate * step
     position = state.position + speed * step
     new_x, new_z = loader.bucket_tip(machine, position, boom, tilt)
+    # A boom that rises swings the bucket forward. At a wall the machine gives way instead.
+    beyond = jnp.maximum(new_x - wall, 0.0)
+    position, new_x = position - beyond, new_x - beyond
     reach = jnp.maximum(state.reach, new_x)
     height, fill = terrain.move(
         machine,
@@ -251,7 +264,7 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
         state.height,
         state.fill,
         state.ground,
-        terrain.Bucket(new_x, new_z, tilt),
+        terrain.Bucket(new_x, new_z, tilt, wall),
         (state.reach, reach),
         step,
         wanted,
@@ -277,7 +290,7 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
 
     # Events: each is a margin that reaches zero.
     def surface_margin(tip_x: Array, tip_z: Array) -> Array:
-        surface = _interpolated(state.profile, tip_x)
+        surface = _interpolated(state.profile, walls.in_front(tip_x, wall))
         early = jnp.maximum(BREAKOUT_FROM - tip_x, 0.0)
         return surface + BREAKOUT_CLEARANCE + early - tip_z
 

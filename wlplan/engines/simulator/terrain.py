@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from wlplan.constants import CELL_SIZE, GRAVITY
 from wlplan.engines.simulator.soil import least_resistance, wedge_of
+from wlplan.engines.simulator.walls import in_front
 from wlplan.site.machine import WheelLoader
 from wlplan.site.soil import Soil
 from wlplan.terrain.automaton import FLOW_FRACTION
@@ -52,11 +53,12 @@ _PUSH_WIDTH = 2.0
 
 
 class Bucket(NamedTuple):
-    """Cutting edge position [m], tilt [rad]."""
+    """Cutting edge position [m], tilt [rad], and position of the wall that it cannot pass [m]."""
 
     x: Float[Array, " b"]
     z: Float[Array, " b"]
     tilt: Float[Array, " b"]
+    wall: Float[Array, " b"]
 
 
 class Reaction(NamedTuple):
@@ -128,13 +130,21 @@ def _hat(distance: Array, half_width: float) -> Array:
     return weight / jnp.maximum(total(weight), 1e-6)[None]
 
 
-def _read(field: Float[Array, "n lanes b"], centre: Float[Array, " b"]) -> Float[Array, "lanes b"]:
-    """The heightfield around a position along the heading, averaged."""
+def _read(
+    field: Float[Array, "n lanes b"], bucket: Bucket, ahead: float
+) -> Float[Array, "lanes b"]:
+    """The heightfield around a position ahead of the edge, averaged.
+
+    A wall is no soil: up to it, and beyond, the surface goes on as high as it is before it.
+    """
+    centre = bucket.x + ahead
     count = math.ceil(2.0 * _READ_LENGTH / CELL_SIZE)
     first = jnp.ceil((centre - _READ_LENGTH - _ALONG[0]) / CELL_SIZE)
     first = jnp.clip(first, 0, STATE_CELLS - count).astype(jnp.int32)
     rows = first[None] + jnp.arange(count, dtype=jnp.int32)[:, None]
     weight = _hat(jnp.asarray(_ALONG, field.dtype)[rows] - centre[None], _READ_LENGTH)
+    last = jnp.floor((in_front(_ALONG[-1], bucket.wall) - _ALONG[0]) / CELL_SIZE)
+    rows = jnp.minimum(rows, jnp.maximum(last, 0.0).astype(jnp.int32)[None])
     return total(weight[:, None] * jnp.take_along_axis(field, rows[:, None], axis=0))
 
 
@@ -179,8 +189,8 @@ def reaction(
     lanes = Lanes(machine)
     width = jnp.asarray(lanes.width, height.dtype)
     met = lanes.of(height)
-    near = _read(met, bucket.x + _AHEAD)
-    far = _read(met, bucket.x + _AHEAD + _SLOPE_LENGTH)
+    near = _read(met, bucket, _AHEAD)
+    far = _read(met, bucket, _AHEAD + _SLOPE_LENGTH)
     near, far = materialize_if((near, far), wanted)
     depth = jnp.maximum(near - bucket.z[None], 0.0)
     slope = jnp.clip(jnp.arctan((far - near) / _SLOPE_LENGTH), _LEAST_SLOPE, _GREATEST_SLOPE)
@@ -329,7 +339,7 @@ def move(
 
     # Soil slides. Cells inside the bucket stand at the level of its mouth: empty, that is the
     # cutting edge, and what lies higher ahead runs in; full, nothing does. They give nothing.
-    mouth = _read(lanes.of(height), bucket.x + _AHEAD)
+    mouth = _read(lanes.of(height), bucket, _AHEAD)
     z = bucket.z[None]
     level = jnp.minimum(mouth, z + (1.0 - open_part) * jnp.maximum(mouth - z, 0.0))
     level = materialize_if(level, wanted)
