@@ -62,7 +62,13 @@ class LoadSearch:
     batch: int = 256
 
     def attempt(
-        self, job: Job, standing: Standing, random: np.random.Generator, watch: Watch
+        self,
+        job: Job,
+        standing: Standing,
+        random: np.random.Generator,
+        watch: Watch,
+        *,
+        known: Float[np.ndarray, "k 4"] | None = None,
     ) -> Tried:
         """Tries every action at every pose.
 
@@ -72,6 +78,7 @@ class LoadSearch:
             random: Source of a shift of all poses, so that they are not tied to one raster, and of
                 the actions.
             watch: Told what it took.
+            known: Actions that were good before, before squashing; they are tried too.
         """
         dtype = job.pile.height.dtype
         count = max(8, round(self.poses_per_metre * float(contour_length(job))))
@@ -79,6 +86,9 @@ class LoadSearch:
         poses = np.stack(np.meshgrid(positions, self.offsets, indexing="ij"), -1)
         poses = poses.reshape(-1, 2).astype(dtype)
         actions = spread_actions(self.actions, random, dtype)
+        if known is not None:
+            # In place of others: what evaluates them is compiled for their number.
+            actions = jnp.concatenate([actions[len(known) :], known])[-self.actions :]
         searched = positions[:: self.neighbours].astype(dtype)
         cusps = _cusps_at(job, standing.pile, searched, batch=self.batch // self.actions)
         of_pose = np.arange(len(poses)) // (self.neighbours * len(self.offsets))
@@ -87,35 +97,33 @@ class LoadSearch:
         watch.spend(costs.size)
         return Tried(poses, cusps, actions, costs, masses)
 
-    def outlook(self, job: Job, standing: Standing, tried: Tried, watch: Watch) -> Outlook:
-        """What loads are like, by those that were tried.
+    def outlook(
+        self, job: Job, standing: Standing, tried: Tried, watch: Watch
+    ) -> tuple[Outlook, Float[np.ndarray, "2 4"]]:
+        """What loads are like, by those that were tried, and the actions of a good and a full one.
 
-        How many buckets a truck takes hangs on what a good one and a full one hold, so for trucks
-        the best are refined first.
+        How many buckets a truck takes hangs on what these two hold, so for trucks the best are
+        refined first.
         """
-        good = _cheapest(tried.costs, tried.masses)
+        rows = [int(np.argmin(_per_tonne(tried.costs, tried.masses)))]
+        rows += [int(np.argmax(np.where(np.isfinite(tried.costs), tried.masses, -np.inf)))]
+        actions = np.asarray(tried.actions)[np.array(rows) % len(tried.actions)]
+        good, full = (
+            _Load(float(tried.costs.flat[row]), float(tried.masses.flat[row])) for row in rows
+        )
         if not isinstance(job.amount, Trucks) or not can_refine(job, self.refine_steps):
-            most = int(np.argmax(np.where(np.isfinite(tried.costs), tried.masses, -np.inf)))
-            return _outlook(good, (tried.costs.flat[most], tried.masses.flat[most]))
+            return _outlook(good, full), actions
         loads = []
-        for factor in (1.0, _WORTH):
-            priced = _outlook(good, good, price=factor * good[0] / good[1])
+        for worth in (1.0, _WORTH):
+            priced = _outlook(good, good, price=worth * good.cost / good.mass)
             best = self.best(job, standing, tried, priced, watch)
-            rows = np.arange(min(len(best.scores), self.actions))
-            poses = np.stack([best.decisions.position, best.decisions.offset], axis=1)
-            # As many actions as always: what evaluates them is compiled for it.
-            actions = jnp.asarray(np.resize(best.decisions.action, (self.actions, 4)))
-            costs, masses = self._costs(job, standing, poses, best.cusps, actions)
-            watch.spend(len(rows))
-            chosen = rows, rows
-            found = costs[chosen], masses[chosen]
-            if factor > 1.0:
-                row = int(np.argmin(best.scores))
-                loads.append((float(found[0][row]), float(found[1][row])))
-            else:
-                loads.append(_cheapest(*found))
-        good, full = loads
-        return _outlook(good, full)
+            row = int(np.argmin(best.scores))
+            one = jax.tree.map(lambda leaf, row=row: leaf[row], (best.decisions, best.cusps))
+            cost, mass = _cost_and_mass(job, standing, *one)
+            watch.spend(1)
+            loads.append((_Load(float(cost), float(mass)), np.asarray(one[0].action)))
+        (good, first), (full, second) = loads
+        return _outlook(good, full), np.stack([first, second])
 
     def best(
         self, job: Job, standing: Standing, tried: Tried, outlook: Outlook, watch: Watch
@@ -172,8 +180,7 @@ class LoadSearch:
 def price_of(job: Job, seed: int, watch: Watch) -> float:
     """What a tonne costs at least, as the pile is."""
     tried = LoadSearch().attempt(job, beginning(job), np.random.default_rng(seed), watch)
-    cost, mass = _cheapest(tried.costs, tried.masses)
-    return cost / mass
+    return float(_per_tonne(tried.costs, tried.masses).min())
 
 
 # Scores are computed in multiples of so many.
@@ -233,19 +240,28 @@ def _cusps_at(job: Job, pile: Pile, positions: Float[np.ndarray, " p"], *, batch
     return joined
 
 
-_Load = tuple[float, float]
-"""Cost and mass [tonne] of a load."""
+class _Load(NamedTuple):
+    cost: float
+    mass: float  # [tonne]
 
 
-def _cheapest(costs: Float[np.ndarray, "*n"], masses: Float[np.ndarray, "*n"]) -> _Load:
-    """The load that costs least a tonne."""
-    per_tonne = np.where(masses > 0.0, costs / np.maximum(masses, 1e-6), np.inf)
-    best = int(np.argmin(per_tonne))
-    return float(costs.flat[best]), float(masses.flat[best])
+def _per_tonne(
+    costs: Float[np.ndarray, "*n"], masses: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
+    """What a tonne costs, infinite where there is none."""
+    return np.where(masses > 0.0, costs / np.maximum(masses, 1e-6), np.inf)
 
 
 def _outlook(good: _Load, full: _Load, price: float = 0.0) -> Outlook:
     return Outlook(*(floats(np.asarray(number)) for number in (*good, *full, price)))
+
+
+@jax.jit
+def _cost_and_mass(
+    job: Job, standing: Standing, decisions: Decisions, cusps: Cusps
+) -> tuple[Array, Array]:
+    found = next_load(job, standing, decisions, cusps)
+    return found.cost, found.performance.mass
 
 
 def _scores(

@@ -34,6 +34,8 @@ _FARTHEST = 500.0
 _ON_PILE = 0.5
 # Dig locations around the pile, and how many of them, the nearest, a place is judged by.
 _LOCATIONS, _NEAREST = 24, 3
+# How far ahead of a dig there has to be soil [m], and which part of what most digs have.
+_AHEAD, _WORTH = 3.0, 0.8
 _HEADING_STEP = 15.0
 # Places for the receiver, in the frame of a dig pose: metres behind it and beside it, and degrees
 # between the headings, either side. They have the shortest ways from a straight face, in the mean
@@ -172,6 +174,7 @@ def _best(
     contour = toe_contour(pile, machine=machine) if contour is None else contour
     digs = edge_poses(contour, _LOCATIONS)
     poses = np.stack([np.asarray(v, float) for v in (digs.x, digs.y, digs.heading)], axis=-1)
+    poses = poses[_yields(poses, pile, machine)]
     apart = np.hypot(*(places[:, None, :2] - poses[None, :, :2]).transpose(2, 0, 1))
     nearest = poses[np.argsort(apart, axis=1)[:, :_NEAREST]]
     room = room_of(yard_of(pile, machine, closed), pile)
@@ -194,6 +197,21 @@ def _best(
             best, least = int(part[cost.argmin()]), float(cost.min())
     chosen: np.ndarray = places[best]
     return chosen
+
+
+def _yields(
+    poses: Float[np.ndarray, "n 3"], pile: Pile, machine: WheelLoader
+) -> Bool[np.ndarray, " n"]:
+    """Whether a dig has about as much soil ahead of it as most have: a spur has not."""
+    ahead, left = np.meshgrid(
+        np.linspace(0.0, _AHEAD, 13), machine.bucket_width * np.linspace(-0.5, 0.5, 7)
+    )
+    c, s = np.cos(poses[:, 2, None, None]), np.sin(poses[:, 2, None, None])
+    x = poses[:, 0, None, None] + ahead * c - left * s
+    y = poses[:, 1, None, None] + ahead * s + left * c
+    above = np.asarray(sample(pile.height - pile.floor, pile, jnp.asarray(x), jnp.asarray(y)))
+    soil = above.mean(axis=(1, 2))
+    return soil >= _WORTH * np.median(soil)
 
 
 @functools.partial(jax.jit, static_argnames="machine")

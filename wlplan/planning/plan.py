@@ -47,7 +47,7 @@ def plan_loads(
     seed: int = 0,
     referee: World | None = None,
     progress: Progress | None = None,
-    budget: float | None = None,
+    budget: int | None = None,
     contour: ToeContour | None = None,
 ) -> PlanResult:
     """Plans the next loadings from a pile.
@@ -124,7 +124,7 @@ def plan_loads(
         raise (
             KeyboardInterrupt
             if watch.stopped == "interrupted"
-            else InputError(f"a budget of {budget:g} loadings is too small for a first plan.")
+            else InputError(f"a budget of {budget} loadings is too small for a first plan.")
         )
     return joined(parts).replace(spent=watch.spent, stopped=watch.stopped)
 

@@ -43,7 +43,7 @@ class Watch:
         stopped: What ended the search early: "", "budget" or "interrupted".
     """
 
-    def __init__(self, progress: Progress | None = None, budget: float | None = None):
+    def __init__(self, progress: Progress | None = None, budget: int | None = None):
         self._progress, self._budget = progress, budget
         self.spent = 0.0
         self.best: Best | None = None
@@ -65,7 +65,7 @@ class Watch:
             return
         self.best = Best(plan, cost)
 
-    def spend(self, loadings: float, gradients: float = 0.0) -> None:
+    def spend(self, loadings: int, gradients: int = 0) -> None:
         """Counts loadings that were evaluated, and those of them whose gradient was taken too.
 
         Raises:

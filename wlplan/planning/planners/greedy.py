@@ -35,13 +35,15 @@ class Greedy(LoadSearch):
         """One plan, leaves [1, N]; arguments as of `Planner.propose`."""
         watch = watching(progress)
         random = np.random.default_rng(seed)
-        standing, chosen, outlook = beginning(job), [], None
+        standing, chosen, outlook, known = beginning(job), [], None, None
         for load in range(loads):
-            tried = self.attempt(job, standing, random, watch)
-            # A truck is filled as it was begun.
-            begun = isinstance(job.amount, Trucks) and bool(standing.done.aboard > 0.0)
-            if outlook is None or not begun:
-                outlook = self.outlook(job, standing, tried, watch)
+            tried = self.attempt(job, standing, random, watch, known=known)
+            if not isinstance(job.amount, Trucks):
+                outlook, _ = self.outlook(job, standing, tried, watch)
+            elif outlook is None or not standing.done.aboard > 0.0:
+                # A truck is filled as it was begun.
+                outlook, known = self.outlook(job, standing, tried, watch)
+                tried = self.attempt(job, standing, random, watch, known=known)
             found = self.best(job, standing, tried, outlook, watch)
             best = int(np.argmin(found.scores))
             decision = jax.tree.map(lambda leaf, b=best: leaf[b], found.decisions)
