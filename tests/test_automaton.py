@@ -26,6 +26,9 @@ from wlplan.terrain.automaton import (
     sweeps,
     window_of,
 )
+from wlplan.terrain.automaton.flow import slide
+from wlplan.terrain.automaton.neighbours import links_of
+from wlplan.terrain.automaton.rounds import _add_change
 from wlplan.terrain.automaton.windows import pad_pile
 from wlplan.terrain.excavation import excavate
 from wlplan.types import Pile, Pose
@@ -312,6 +315,81 @@ def test_gradient_of_settling_against_finite_differences_with_mask_and_floor() -
 
         assert jnp.abs(settle(pile).pile.height - pile.height).max() > 0.1
         assert_gradient(cost, pile.height, relative=1e-5, skip=8)
+
+
+def test_gradient_of_a_bare_floor() -> None:
+    """Cells on which nothing lies count as any other."""
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(2)
+        cone = 0.6 - 0.1 * np.hypot(*np.indices((14, 11)) - np.array([5.5, 4.0])[:, None, None])
+        height = jnp.asarray(np.maximum(cone, 0.0))
+        assert (height == 0.0).sum() > 30
+        weight = jnp.asarray(rng.normal(size=height.shape))
+        assert_gradient(
+            lambda h: (weight * settle(Pile(h, 0.1)).pile.height).sum(), height, relative=1e-5
+        )
+
+
+def thin(shape: tuple[int, int] = (16, 12)) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Heaps of soil on a steep floor; heights, floor, and the cells that take part."""
+    rng = np.random.default_rng(0)
+    i, j = np.indices(shape)
+    floor = 0.9 * DROP * np.hypot(i - 8.3, j - 5.2)
+    soil = 0.8 * rng.random(shape) * (np.hypot(i - 4.1, j - 5.2) < 3.5)
+    return jnp.asarray(floor + soil), jnp.asarray(floor), jnp.asarray(rng.random(shape) > 0.02)
+
+
+def test_momentum_takes_no_more_from_a_cell_than_lies_there() -> None:
+    with jax.enable_x64(True):
+        height, floor, active = thin()
+        links = links_of(active)
+
+        def slid(height: jax.Array, floor: jax.Array = floor) -> jax.Array:
+            return slide(height, floor, links, DROP, 0.95, 12)
+
+        unlimited = slid(height, jnp.full_like(floor, -jnp.inf))
+        assert (unlimited - floor).min() < -1e-3, "the floor is not in the way"
+        after = slid(height)
+        assert (after - floor).min() >= -1e-15
+        assert jnp.abs(after - height).max() > 0.01
+        assert_volume_kept(height, after, relative=1e-14)
+        # Each member of a batch as it is alone, whether the floor is in its way or not.
+        floors = jnp.stack([floor, floor - 1.0])
+        both = jax.vmap(lambda f: slid(height, f))(floors)
+        np.testing.assert_allclose(both[0], after, atol=1e-14)
+        np.testing.assert_allclose(both[1], unlimited, atol=1e-14)
+        weight = jnp.asarray(np.random.default_rng(1).normal(size=height.shape))
+        assert_gradient(lambda h: (weight * slid(h)).sum(), height, relative=1e-5)
+
+
+def test_a_coarse_change_takes_no_more_from_a_cell_than_lies_there() -> None:
+    with jax.enable_x64(True):
+        height, floor, active = thin()
+        lies = jnp.where(active, height - floor, 0.0).reshape(8, 2, 6, 2)
+        whole = active.reshape(8, 2, 6, 2).all(axis=(1, 3))
+        # As much as coarse cells have, at most; what they give another one gets.
+        loss = jnp.where(whole, lies.mean(axis=(1, 3)), 0.0) * jnp.asarray(
+            np.random.default_rng(3).choice([0.0, 0.5, 1.0], (8, 6))
+        )
+        change = -loss + jnp.zeros_like(loss).at[1, 1].set(loss.sum() * whole[1, 1])
+        assert whole[1, 1]
+
+        def added(arguments: tuple[jax.Array, jax.Array], floor: jax.Array = floor) -> jax.Array:
+            height, change = arguments
+            return _add_change(height, jnp.where(whole, change, 0.0), floor, active)
+
+        unlimited = added((height, change), jnp.full_like(floor, -jnp.inf))
+        assert (unlimited - floor).min() < -1e-3, "the floor is not in the way"
+        after = added((height, change))
+        assert (after - floor).min() >= -1e-15
+        for surface in (unlimited, after):
+            assert_volume_kept(height, surface, relative=1e-14)
+            np.testing.assert_array_equal(surface[~active], height[~active])
+        # No change is zero, no cell is bare: there are the kinks.
+        some = jnp.asarray(1e-3 + 1e-3 * np.random.default_rng(4).random(height.shape))
+        point = (height + some, jnp.where(whole, 0.9 * change - 5e-4, 0.0))
+        weight = jnp.asarray(np.random.default_rng(1).normal(size=height.shape))
+        assert_gradient(lambda at: (weight * added(at)).sum(), point, relative=1e-5)
 
 
 def test_gradient_through_several_windows_against_finite_differences() -> None:

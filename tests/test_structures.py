@@ -1,5 +1,6 @@
 """What is not soil: found where it stands, left standing, and no way through it."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -8,13 +9,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from laws import volume
+from laws import assert_volume_kept, volume
 
 import wlplan
 from wlplan.errors import InputError
 from wlplan.io import read_scan
 from wlplan.site.frame import LOCAL
-from wlplan.terrain.automaton import relax
+from wlplan.terrain.automaton import (
+    DEFAULT_SCHEDULE,
+    Schedule,
+    converged,
+    relax,
+    settle,
+    settle_dug,
+)
 from wlplan.terrain.excavation import excavate
 from wlplan.terrain.heightmap import add_local_change
 from wlplan.terrain.standing import lower_envelope, standing
@@ -284,6 +292,72 @@ def test_soil_does_not_pass_a_wall(diagonal: bool) -> None:
     )
     assert (np.asarray(after.height) >= np.asarray(after.floor) - 1e-6).all()
     assert not np.array_equal(np.asarray(after.height), np.asarray(before.height))
+
+
+def parted(kind: str, shape: tuple[int, int] = (64, 72)) -> tuple[Pile, np.ndarray, np.ndarray]:
+    """Soil much steeper than it stands on both sides of a wall of one cell; the cells of each side.
+
+    It leans on the wall and slides on a floor that falls away from it. The "open" wall has an end,
+    which the soil does not come near.
+    """
+    i, j = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")
+    away = (i + j - 70) / np.sqrt(2.0) if kind == "diagonal" else i - 31.0
+    along = (i - j) / np.sqrt(2.0) if kind == "diagonal" else j - 24.0
+    # Cells of a diagonal touch at their sides.
+    wall = (away > -0.1) & (away < 0.8) & ((kind != "open") | (along < 38))
+    slope = np.tan(np.radians(28.0))
+    floor = CELL * slope * np.clip(25 - np.abs(away), 0, None)
+    ground = np.where(wall, 4.0, floor)
+    tall = np.where(away < 0, 1.6, 1.1) - 0.12 * np.abs(away)
+    blocks = 0.3 * ((np.abs(away) > 14) & (np.abs(away) < 19))
+    soil = np.where(wall | (np.abs(along) > 18), 0.0, np.maximum(tall, blocks))
+    noise = 0.02 * np.random.default_rng(0).random(shape) * (soil > 0)
+    pile = Pile(jnp.asarray(ground + soil + noise), CELL, ground=jnp.asarray(ground))
+    return pile, (away < 0) & ~wall, (away > 0) & ~wall
+
+
+PLAIN = dataclasses.replace(DEFAULT_SCHEDULE, momentum=0.0)
+
+
+@pytest.mark.parametrize("kind", ["straight", "diagonal", "open"])
+@pytest.mark.parametrize("schedule", [DEFAULT_SCHEDULE, PLAIN], ids=["momentum", "plain"])
+def test_soil_stays_on_its_side_of_a_wall(kind: str, schedule: Schedule) -> None:
+    """Each side keeps its volume to rounding, and neither has a gradient in the other."""
+    with jax.enable_x64(True):
+        pile, left, right = parted(kind)
+
+        def of_left(height: jax.Array) -> tuple[jax.Array, Pile]:
+            after = settle(pile.replace(height=height), schedule=schedule).pile
+            return jnp.where(left, after.height, 0.0).sum(), after
+
+        (_, after), gradient = jax.value_and_grad(of_left, has_aux=True)(pile.height)
+        assert float(jnp.abs(after.height - pile.height).max()) > 0.5
+        for side in (left, right):
+            assert_volume_kept(pile.height[side], after.height[side], relative=1e-13)
+        np.testing.assert_allclose(gradient, np.where(left, 1.0, 0.0), atol=1e-12)
+        assert (np.asarray(after.height) >= np.asarray(pile.floor) - 1e-12).all()
+
+
+@pytest.mark.parametrize("kind", ["straight", "diagonal"])
+def test_soil_stays_on_its_side_in_every_way_to_relax_it(kind: str) -> None:
+    """A whole pile, several windows, a batch, and sweeps alone; in float32."""
+    pile, *sides = parted(kind)
+    pile = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), pile)
+    start = (jnp.int32(12), jnp.int32(8))
+    window = jax.lax.dynamic_slice(pile.height, start, (40, 40))
+    after = {
+        "relax": relax(pile).height,
+        "windows": settle_dug(pile, window, start).pile.height,
+        "batch": jax.vmap(lambda h: settle(pile.replace(height=h)).pile.height)(
+            jnp.stack([pile.height, pile.height])
+        )[1],
+        "converged": converged(pile, tolerance=np.radians(5.0)).height,
+    }
+    for name, height in after.items():
+        assert float(jnp.abs(height - pile.height).max()) > 0.3, name
+        for side in sides:
+            soil = [np.asarray(h - pile.floor, np.float64)[side] for h in (pile.height, height)]
+            assert_volume_kept(*soil, relative=1e-5 if name == "converged" else 1e-6)
 
 
 def test_ground_is_not_dug() -> None:

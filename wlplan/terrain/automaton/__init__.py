@@ -16,6 +16,8 @@ Sweeps alone take thousands to bring a bucket's hole to rest. `settle` gets ther
 - Momentum. A sweep is a step of gradient descent on the energy sum max(excess, 0)^2 / 2, and the
   heavy-ball method speeds that up. It starts anew as soon as its velocity points uphill, which
   keeps it from overshooting.
+- Neither takes more from a cell than lies on its floor, or gives soil to cells that do not exchange
+  any with it: it does not pass a wall.
 - Rounds of both are repeated until the steepest slope is within a tolerance, and no more.
 
 Gradients: reverse mode with respect to the height, exact for the sweeps that were made, by rules

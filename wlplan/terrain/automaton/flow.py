@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,8 @@ from wlplan.terrain.automaton.neighbours import BITS, NEIGHBOURS, links_of, neig
 from wlplan.terrain.automaton.slopes import movable, steeper_than
 from wlplan.types import Pile
 from wlplan.xla import materialize
+
+_Kept = TypeVar("_Kept")
 
 # Part of the excess height that an edge moves in one sweep; 1 / (number of neighbours) is the
 # largest value at which a sweep is non-expansive.
@@ -88,7 +92,7 @@ def sweeps(
 
 def _many_sweeps(height: Array, links: Array | None, drop: float, count: int) -> Array:
     if count <= _KEPT:
-        return slide(height, links, drop, 0.0, count)
+        return slide(height, jnp.full_like(height, -jnp.inf), links, drop, 0.0, count)
     part = 1
     while part * _KEPT < count:
         part *= _KEPT
@@ -102,9 +106,10 @@ def _many_sweeps(height: Array, links: Array | None, drop: float, count: int) ->
     return _many_sweeps(height, links, drop, rest) if rest else height
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
+@partial(jax.custom_vjp, nondiff_argnums=(3, 4, 5))
 def slide(
     height: Float[Array, "nx ny"],
+    floor: Float[Array, "nx ny"],
     links: UInt8[Array, "nx ny"] | None,
     drop: float,
     momentum: float,
@@ -112,7 +117,17 @@ def slide(
 ) -> Float[Array, "nx ny"]:
     """`count` sweeps from standstill, each as far as the last and further: the heavy-ball method.
 
-    The velocity is dropped when it points uphill, against what the sweep itself would do.
+    The velocity is dropped when it points uphill, against what the sweep itself would do. If a
+    cell would end below its floor, the sweeps are made again, and the velocity is dropped as well
+    before it takes more from a cell than lies there. A sweep from standstill never does that.
+
+    Args:
+        height: Surface [m].
+        floor: What cannot be moved [m].
+        links: Which neighbours exchange soil, see `links_of`; None: all.
+        drop: Largest stable height difference between two cells that share a side [m].
+        momentum: Part of the velocity that is kept from sweep to sweep.
+        count: Number of sweeps.
     """
     if momentum == 0.0:
 
@@ -121,27 +136,60 @@ def slide(
 
         return neighbour(lax.fori_loop(0, count, plain, rim(height)), 0, 0)
 
-    def step(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        return _sweep_on(state, links, drop, momentum)[0]
+    def step(lowest: Array | None, _: Array, state: _Moving, kept: None) -> tuple[_Moving, None]:
+        return _sweep_on(state, lowest, links, drop, momentum)[0], kept
 
-    rimmed, _ = lax.fori_loop(0, count, step, _at_standstill(height))
+    (rimmed, _), _ = _above_floor(floor, step, height, None, count)
     return neighbour(rimmed, 0, 0)
 
 
-def _at_standstill(height: Array) -> tuple[Array, Array]:
-    return rim(height), jnp.zeros_like(height)
+# Surface with its rim, and velocity.
+_Moving = tuple[Array, Array]
+
+
+def _above_floor(
+    floor: Array,
+    step: Callable[[Array | None, Array, _Moving, _Kept], tuple[_Moving, _Kept]],
+    height: Array,
+    kept: _Kept,
+    count: int,
+) -> tuple[_Moving, _Kept]:
+    """So many steps from standstill, and what they write down.
+
+    If they end below the floor they are made again, and are told how low the surface may get.
+    """
+    lowest = jnp.minimum(floor, height)
+    begin = rim(height), jnp.zeros_like(height)
+    end, kept = lax.fori_loop(0, count, lambda k, carry: step(None, k, *carry), (begin, kept))
+    again = below(neighbour(end[0], 0, 0), lowest)
+    state = jax.tree.map(lambda a, b: jnp.where(again, a, b), begin, end)
+    # Not a branch, which a batch on a GPU would always take.
+    more = jnp.where(again, count, 0)
+    result: tuple[_Moving, _Kept] = lax.fori_loop(
+        0, more, lambda k, carry: step(lowest, k, *carry), (state, kept)
+    )
+    return result
+
+
+def below(height: Array, lowest: Array) -> Bool[Array, ""]:
+    """Whether any cell of a surface is lower than another surface."""
+    # XLA's sums are many times faster on a CPU than its `any`.
+    return jnp.where(height < lowest, 1.0, 0.0).sum() > 0.0
 
 
 def _sweep_on(
-    state: tuple[Array, Array], links: Array | None, drop: float, momentum: float
-) -> tuple[tuple[Array, Array], Array]:
+    state: _Moving, lowest: Array | None, links: Array | None, drop: float, momentum: float
+) -> tuple[_Moving, Array]:
     """Surface with its rim and velocity after one more sweep, and how much velocity was kept."""
     rimmed, velocity = state
+    height = neighbour(rimmed, 0, 0)
     flow = materialize(-FLOW_FRACTION * _outflow(rimmed, drop, links), rimmed[0, 0])
-    uphill = jnp.vdot(flow, velocity) < 0.0
-    part = jnp.where(uphill, jnp.zeros((), flow.dtype), jnp.asarray(momentum, flow.dtype))
+    dropped = jnp.vdot(flow, velocity) < 0.0
+    if lowest is not None:
+        dropped = dropped | below(height + momentum * velocity + flow, lowest)
+    part = jnp.where(dropped, jnp.zeros((), flow.dtype), jnp.asarray(momentum, flow.dtype))
     velocity = part * velocity + flow
-    return (rim(neighbour(rimmed, 0, 0) + velocity), velocity), part
+    return (rim(height + velocity), velocity), part
 
 
 # For the reverse rule of `slide`: surface and part of the velocity of each sweep, and the links.
@@ -149,21 +197,24 @@ _Record = tuple[Array, Array, Array | None]
 
 
 def _slide_forward(
-    height: Array, links: Array | None, drop: float, momentum: float, count: int
+    height: Array, floor: Array, links: Array | None, drop: float, momentum: float, count: int
 ) -> tuple[Array, _Record]:
     def step(
-        state: tuple[Array, Array], _: None
-    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        after, part = _sweep_on(state, links, drop, momentum)
-        return after, (state[0], part)
+        lowest: Array | None, k: Array, state: _Moving, kept: tuple[Array, Array]
+    ) -> tuple[_Moving, tuple[Array, Array]]:
+        (surfaces, parts), surface = kept, state[0]
+        state, part = _sweep_on(state, lowest, links, drop, momentum)
+        return state, (surfaces.at[k].set(surface), parts.at[k].set(part))
 
-    (rimmed, _), (surfaces, parts) = lax.scan(step, _at_standstill(height), None, length=count)
+    surfaces = jnp.zeros((count, *rim(height).shape), height.dtype)
+    kept = surfaces, jnp.zeros(count, height.dtype)
+    (rimmed, _), (surfaces, parts) = _above_floor(floor, step, height, kept, count)
     return neighbour(rimmed, 0, 0), (surfaces, parts, links)
 
 
 def _slide_backward(
     drop: float, momentum: float, count: int, record: _Record, cotangent: Array
-) -> tuple[Array, None]:
+) -> tuple[Array, None, None]:
     surfaces, parts, links = record
 
     # `both` is the cotangent of a sweep's velocity: that of the next velocity and of the surface.
@@ -178,7 +229,7 @@ def _slide_backward(
 
     start = (rim(cotangent), rim(cotangent))
     (height, _), _ = lax.scan(step, start, (surfaces, parts), reverse=True)
-    return neighbour(height, 0, 0), None
+    return neighbour(height, 0, 0), None, None
 
 
 slide.defvjp(_slide_forward, _slide_backward)

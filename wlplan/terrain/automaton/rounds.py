@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from wlplan.terrain.automaton.flow import slide
+from wlplan.terrain.automaton.flow import below, slide
 from wlplan.terrain.automaton.neighbours import links_of
 
 
@@ -70,20 +72,69 @@ def _refine(field: Array) -> Array:
     return field
 
 
-def _add_change(height: Array, change: Array, terrain: Terrain) -> Array:
-    """Adds a change of zero net volume, without digging under the floor or moving unseen cells."""
-    ground, active = terrain
-    floor = jnp.zeros_like(height) if ground is None else ground
-    loss = jnp.minimum(jnp.maximum(-change, 0.0), jnp.maximum(height - floor, 0.0))
-    gain = jnp.maximum(change, 0.0)
+def _taps(field: Array, axis: int) -> tuple[Array, Array, Array, Array]:
+    """The four cells along an axis that `_refine` shares a coarse cell out to, in order."""
+    around = jnp.pad(field, [(1, 1) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
+    n = field.shape[axis]
+    a, b, c, d = (lax.slice_in_dim(around, k, k + n - 1, 2, axis) for k in range(4))
+    return a, b, c, d
+
+
+def _repeat(field: Array) -> Array:
+    """Each cell as two by two of half the spacing."""
+    return jnp.repeat(jnp.repeat(field, 2, 0), 2, 1)
+
+
+def _hand_down(change: Array, active: Array | None) -> Array:
+    """A change of the coarser grid, shared out among the cells that take part.
+
+    What `_refine` would give to one that takes no part goes to the coarse cell's own. All that a
+    coarse cell reaches then touches it and exchanges soil with it, so nothing passes a wall.
+    """
+    if active is None:
+        return _refine(change)
+    given = active.astype(change.dtype)
+    for axis in (0, 1):
+        a, b, c, d = _taps(given, axis)
+        given = 0.125 * (a + d) + 0.375 * (b + c)
+    return jnp.where(active, _refine(change) + _repeat((1.0 - given) * change), 0.0)
+
+
+def _hand_down_above(floor: Array, height: Array, change: Array, active: Array | None) -> Array:
+    """`_hand_down`, but no cell gives more than lies on its floor.
+
+    In each of its own cells a coarse cell can take the same share of what lies there, which is
+    enough. It takes as much of its loss in the smooth way as the others leave it in all cells.
+    """
+    lies = jnp.maximum(height - floor, 0.0)
     if active is not None:
-        loss, gain = jnp.where(active, loss, 0.0), jnp.where(active, gain, 0.0)
-    lost, gained = loss.sum(), gain.sum()
-    # What may not be taken here is not delivered there. The inner where keeps the gradient of
-    # the quotient finite when nothing moves.
-    moves = (gained > 0.0) & (lost > 0.0)
-    scale = jnp.where(moves, lost / jnp.where(moves, gained, 1.0), 0.0)
-    return height - jnp.where(moves, loss, 0.0) + scale * gain
+        lies = jnp.where(active, lies, 0.0)
+    loss, on_average = jnp.maximum(-change, 0.0), _coarsen(lies)
+    # The inner where keeps the gradients of both quotients finite.
+    some = on_average > 0.0
+    share = jnp.where(some, loss / jnp.where(some, on_average, 1.0), 0.0)
+    left = lies * jnp.maximum(1.0 - _repeat(share), 0.0)
+    wanted = _hand_down(loss, active)
+    short = wanted > left
+    smooth = jnp.where(short, left / jnp.where(short, wanted, 1.0), 1.0)
+    for axis in (0, 1):
+        smooth = functools.reduce(jnp.minimum, _taps(smooth, axis))
+    own = 1.0 - smooth
+    return _hand_down(change + own * loss, active) - lies * _repeat(own * share)
+
+
+def _add_change(height: Array, change: Array, floor: Array, active: Array | None) -> Array:
+    """Adds a change of the coarser grid, without digging below the floor."""
+    after = height + _hand_down(change, active)
+
+    # Seldom needed, so reverse mode keeps nothing of it.
+    @jax.checkpoint
+    def above(height: Array, change: Array) -> Array:
+        return height + _hand_down_above(floor, height, change, active)
+
+    too_low = below(after, jnp.minimum(floor, height))
+    result: Array = lax.cond(too_low, lambda: above(height, change), lambda: after)
+    return result
 
 
 def one_round(
@@ -99,6 +150,7 @@ def one_round(
         level: The spacing is 2^level of that of the pile.
     """
     ground, active = terrain
+    floor = jnp.zeros_like(height) if ground is None else ground
     if level + 1 < len(schedule.sweeps):
         coarse = _coarsen(height)
         coarse_terrain = Terrain(
@@ -107,8 +159,6 @@ def one_round(
             None if active is None else _coarsen(active.astype(height.dtype)) == 1.0,
         )
         relaxed = one_round(coarse, coarse_terrain, 2.0 * drop, schedule, level + 1)
-        height = _add_change(height, _refine(relaxed - coarse), terrain)
+        height = _add_change(height, relaxed - coarse, floor, active)
     links = None if active is None else links_of(active)
-    slid = slide(height, links, drop, schedule.momentum, schedule.sweeps[level])
-    # A sweep stops at the floor; its momentum might not.
-    return _add_change(height, slid - height, terrain) if schedule.momentum else slid
+    return slide(height, floor, links, drop, schedule.momentum, schedule.sweeps[level])
