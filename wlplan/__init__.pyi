@@ -9,6 +9,10 @@ from .io.plans import read_plan as read_plan
 from .io.plans import write_plan as write_plan
 from .io.summary import info as info
 from .planning import planners as planners
+from .planning.amounts import Empty as Empty
+from .planning.amounts import Loads as Loads
+from .planning.amounts import Tonnes as Tonnes
+from .planning.amounts import Trucks as Trucks
 from .planning.job import Job as Job
 from .planning.loading import Loading as Loading
 from .planning.objective import Constraint as Constraint

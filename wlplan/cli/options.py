@@ -477,13 +477,35 @@ model_options = (
         "phi that ships (high) or of cutting out a strip (low, hybrid).",
     ),
 )
+
+
+class PlaceOrAuto(Numbers):
+    """A place, or the word for leaving it to the planner."""
+
+    def __init__(self) -> None:
+        super().__init__("X,Y[,HEADING_DEG]|auto", 2)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The numbers of a text, or the word itself."""
+        return value if value == AUTO else super().convert(value, param, ctx)
+
+
+AUTO = "auto"
+"""What stands for a truck that the planner places."""
+
+_TRUCK_HELP = (
+    "Where the loader stands when it dumps [m], in the coordinates of the scan, and its heading "
+    "there. Default heading: the one with the shortest ways. Default place: beside the pile, where "
+    "the ways are short"
+)
 truck_option = click.option(
+    "--truck", type=Numbers("X,Y[,HEADING_DEG]", 2), default=None, help=f"{_TRUCK_HELP}."
+)
+placed_truck_option = click.option(
     "--truck",
-    type=Numbers("X,Y[,HEADING_DEG]", 2),
+    type=PlaceOrAuto(),
     default=None,
-    help="Where the loader stands when it dumps [m], in the coordinates of the scan, and its "
-    "heading there. Default heading: the one with the shortest ways. Default place: beside the "
-    "pile, where the ways are short.",
+    help=f"{_TRUCK_HELP}; auto: where the planner finds loads cheapest.",
 )
 out_option = click.option(
     "--out", metavar="DIR", default=None, help="Folder to write to. It is made if it is missing."

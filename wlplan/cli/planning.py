@@ -23,12 +23,14 @@ from wlplan.cli.inputs import (
     world_named,
 )
 from wlplan.cli.options import (
+    AUTO,
     PileFile,
     engine_option,
     model_options,
     objective_option,
     out_option,
     pile_argument,
+    placed_truck_option,
     planner_option,
     site_options,
     truck_option,
@@ -68,7 +70,7 @@ _ORIGIN_FIELDS = ("world", "model", "pile_state", "planner", "seed")
         show_default=True,
         help="Let the simulator pick among the planner's best plans.",
     ),
-    truck_option,
+    placed_truck_option,
     *site_options(),
     *model_options,
     out_option,
@@ -80,7 +82,7 @@ def plan(
     planner: str,
     objective: str | None,
     referee: bool,
-    truck: tuple[float, ...] | None,
+    truck: tuple[float, ...] | str | None,
     soil: str | None,
     machine: str | None,
     model: str | None,
@@ -114,7 +116,8 @@ def plan(
     goal = objective_of(objective_named(objective))
     chosen = planner_named(planner)
     in_simulator = world_name == "simulator"
-    place = site.with_receiver(named, truck)
+    placed = None if truck == AUTO else truck
+    place = site.with_receiver(named, placed)
     with Progress() as progress:
         with Stopwatch() as planning:
             planned = ready(
@@ -125,12 +128,14 @@ def plan(
                     objective=goal,
                     planner=chosen,
                     site=place,
+                    truck="auto" if truck == AUTO else None,
                     seed=seed,
                     referee=simulator if referee and not in_simulator else None,
                     progress=progress,
                     contour=named.contour,
                 )
             )
+        place = place.replace(receiver=planned.receiver)
         with Stopwatch() as playing:
             simulated = planned.refereed or planned
             if planned.refereed is None and not in_simulator:

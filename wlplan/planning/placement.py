@@ -32,8 +32,9 @@ from wlplan.xla import ParallelMap
 _FARTHEST = 500.0
 # Height above the floor that counts as on the pile [m].
 _ON_PILE = 0.5
-# Dig locations around the pile, and how many of them, the nearest, a place is judged by.
-_LOCATIONS, _NEAREST = 24, 3
+# Dig locations around the pile; a place is judged by the best three of so many that are nearest:
+# some of them the truck is in the way of.
+_LOCATIONS, _NEAREST, _BEST = 24, 6, 3
 # How far ahead of a dig there has to be soil [m], and which part of what most digs have.
 _AHEAD, _WORTH = 3.0, 0.8
 _HEADING_STEP = 15.0
@@ -144,12 +145,21 @@ def best_receiver(
         InputError: If a bucket can start nowhere on the toe.
     """
     contour = toe_contour(pile, machine=machine) if contour is None else contour
-    digs = edge_poses(contour, _LOCATIONS)
+    places = places_around(edge_poses(contour, _LOCATIONS))
+    return receiver_at(_best(places, pile, machine, contour, closed), pile)
+
+
+def places_around(digs: Pose) -> Float[np.ndarray, "n 3"]:
+    """Places x [m], y [m], heading [rad] from where a V-turn to some dig is short.
+
+    Args:
+        digs: Dig poses, leaves [m].
+    """
     x, y, into = (np.asarray(v, float)[:, None] for v in (digs.x, digs.y, digs.heading))
     back, side, turn = np.array(
         [(b, sign * s, sign * t) for b, s, t in (*_STANDS, *_FURTHER) for sign in (1.0, -1.0)]
     ).T
-    places = np.stack(
+    places: np.ndarray = np.stack(
         [
             x - back * np.cos(into) - side * np.sin(into),
             y - back * np.sin(into) + side * np.cos(into),
@@ -157,10 +167,14 @@ def best_receiver(
         ],
         axis=-1,
     ).reshape(-1, 3)
-    dtype = pile.height.dtype
-    px, py, heading = _best(places, pile, machine, contour, closed)
+    return places
+
+
+def receiver_at(place: Float[np.ndarray, "3"], pile: Pile) -> Receiver:
+    """The receiver at a place x [m], y [m], heading [rad], in the precision of a pile."""
+    x, y, heading = (float(value) for value in place)
     heading = math.remainder(heading, 2.0 * math.pi)
-    return Receiver(*(jnp.asarray(v, dtype) for v in (px, py, heading)))
+    return Receiver(*(jnp.asarray(v, pile.height.dtype) for v in (x, y, heading)))
 
 
 def _best(
@@ -180,9 +194,10 @@ def _best(
     room = room_of(yard_of(pile, machine, closed), pile)
     dtype = pile.height.dtype
     at, digs_of = jnp.asarray(places, dtype), jnp.asarray(nearest, dtype)
-    truck = _cost_of_truck(places, pile, machine)
+    truck = cost_of_truck(places, pile, machine)
     # The shortest ways come first: once one is found, most of the others need no look.
-    bound = np.asarray(_mean_lengths(at, digs_of, machine)) + truck
+    lengths = np.asarray(way_lengths(at, digs_of, machine))
+    bound = np.sort(lengths, axis=1)[:, :_BEST].mean(axis=1) + truck
     order = np.argsort(bound)
     order = np.concatenate([order, np.repeat(order[-1:], -len(order) % _BATCH)])
     best, least = 0, np.inf
@@ -211,25 +226,26 @@ def _yields(
     y = poses[:, 1, None, None] + ahead * s + left * c
     above = np.asarray(sample(pile.height - pile.floor, pile, jnp.asarray(x), jnp.asarray(y)))
     soil = above.mean(axis=(1, 2))
-    return soil >= _WORTH * np.median(soil)
+    enough: np.ndarray = soil >= _WORTH * np.median(soil)
+    return enough
 
 
 @functools.partial(jax.jit, static_argnames="machine")
-def _mean_lengths(
+def way_lengths(
     places: Float[Array, "n 3"], poses: Float[Array, "n m 3"], machine: WheelLoader
-) -> Float[Array, " n"]:
-    """Length of the ways from poses to receivers in the mean, were nothing in the way [m]."""
+) -> Float[Array, "n m"]:
+    """Length of the ways from poses to receivers, were nothing in the way [m]."""
 
     def one(place: Array, at: Array) -> Array:
         return open_length(Pose(*at), Receiver(*place), machine)
 
-    return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(places, poses).mean(axis=1)
+    return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(places, poses)
 
 
 def _mean_ways_of(
     shared: tuple[Pile, Room, Site], some: tuple[Float[Array, "n 3"], Float[Array, "n m 3"]]
 ) -> Float[Array, " n"]:
-    """What the ways from poses to receivers cost in the mean [m]."""
+    """What the ways from the best of some poses to receivers cost in the mean [m]."""
     pile, room, site = shared
     machine = site.machine
 
@@ -239,7 +255,8 @@ def _mean_ways_of(
         lane = lane_touching(pose, receiver, pile, room.yard, machine)
         return length + _TOUCHING * (touching + lane)
 
-    return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(*some).mean(axis=1)
+    ways = jax.vmap(jax.vmap(one, in_axes=(None, 0)))(*some)
+    return jnp.sort(ways, axis=1)[:, :_BEST].mean(axis=1)
 
 
 _mean_ways = ParallelMap(_mean_ways_of)
@@ -261,7 +278,7 @@ def truck_cells(
     )
 
 
-def _cost_of_truck(
+def cost_of_truck(
     places: Float[np.ndarray, "n 3"], pile: Pile, machine: WheelLoader
 ) -> Float[np.ndarray, " n"]:
     """What it costs that a truck stands on something or on unseen ground [m]."""

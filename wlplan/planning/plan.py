@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,9 @@ from wlplan.planning.playing import (
     outcomes,
 )
 from wlplan.planning.proposals import NothingWorthIt, Planner, Progress, Proposals
-from wlplan.planning.watch import BudgetSpent, Watch
+from wlplan.planning.spots import TRIED, at_receiver, best_spots
+from wlplan.planning.watch import Watch
+from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour
 from wlplan.types import LoadingPlan, Pile, World
@@ -44,6 +47,7 @@ def plan_loads(
     objective: str | Objective | Mapping[str, Any] | Callable[..., Any] | None = None,
     planner: str | Planner = "gradient",
     site: Site | None = None,
+    truck: Literal["auto"] | None = None,
     seed: int = 0,
     referee: World | None = None,
     progress: Progress | None = None,
@@ -62,8 +66,10 @@ def plan_loads(
         objective: A name, an `Objective`, a mapping of named terms, or a function of a loading.
             Default: "efficiency" for a number of loads, "delivery" for other amounts.
         planner: A name of `wlplan.planners.NAMES`, or a planner with settings of its own.
-        site: Machine, soil and receiver; default: the WA320 in gravel, and the follow-up's
-            receiver beside the pile.
+        site: Machine, soil and receiver; default: the WA320 in gravel, and a receiver beside the
+            pile, see `wlplan.planning.placement`.
+        truck: "auto": the planner chooses where it stands, see `wlplan.planning.spots`; the result
+            says where. None: at the receiver of the site.
         seed: Of everything random.
         referee: World that plays the planner's candidates, each dig at the toe of the pile as the
             referee has it by then, and picks the cheapest; the poses of the result are the ones
@@ -98,49 +104,64 @@ def plan_loads(
     parts: list[PlanResult] = []
     typical = typical_load(job.site)
     while not watch.stopped and (part := amount.part(made, typical)) is not None:
+        of_part, rows = job.replace(amount=part[0]), part[1]
+        proposals = None
         try:
-            of_part = with_toe(job.replace(amount=part[0]), None if parts else contour)
-            if isinstance(part[0], Tonnes):
-                # Until loads were planned, by those that could be made.
-                price = _price(parts) if parts else price_of(of_part, seed, watch)
-                of_part = of_part.replace(amount=part[0].replace(price=price))
-            proposals = _proposals(chosen, of_part, part[1], seed + len(parts), watch)
+            with watch.ending():
+                of_part = with_toe(of_part, None if parts else contour)
+                if truck == "auto" and not parts:
+                    of_part = at_receiver(of_part, _best_spot(of_part, rows, seed, watch))
+                    job = at_receiver(job, of_part.site.placed_receiver)
+                if isinstance(part[0], Tonnes):
+                    # Until loads were planned, by those that could be made.
+                    price = _price(parts) if parts else price_of(of_part, seed, watch)
+                    of_part = of_part.replace(amount=part[0].replace(price=price))
+                watch.best = None
+                proposals = chosen.propose(of_part, rows, seed=seed + len(parts), progress=watch)
         except (InputError, NothingWorthIt):
             # Of what was planned already, nothing is lost.
             if not parts:
                 raise
             break
+        if proposals is None and watch.best is not None:
+            watch("best so far", 0, 1, None)
+            proposals = Proposals(watch.best.plan)
         if proposals is None:
             break
         result = choose(of_part, proposals, referee=checked)
-        parts.append(result)
-        after = (result.refereed or result).rollout.pile
-        # What is planned next is planned on the pile as the referee has it by then.
-        job = job.replace(pile=after)
-        made = _made_with(made, result)
         if not len(result.costs):
             break
+        parts.append(result)
+        made = _made_with(made, result)
+        # What is planned next is planned on the pile as the referee has it by then.
+        job = job.replace(pile=(result.refereed or result).rollout.pile)
+    if not parts and watch.stopped == "interrupted":
+        raise KeyboardInterrupt
     if not parts:
-        raise (
-            KeyboardInterrupt
-            if watch.stopped == "interrupted"
-            else InputError(f"a budget of {budget} loadings is too small for a first plan.")
-        )
-    return joined(parts).replace(spent=watch.spent, stopped=watch.stopped)
+        raise InputError(f"a budget of {budget} loadings is too small for a first plan.")
+    return joined(parts).replace(
+        receiver=job.site.placed_receiver, spent=watch.spent, stopped=watch.stopped
+    )
 
 
-def _proposals(planner: Planner, job: Job, rows: int, seed: int, watch: Watch) -> Proposals | None:
-    """What a planner proposes, or the best it had when it was stopped; None if there was none."""
-    watch.best = None
-    try:
-        return planner.propose(job, rows, seed=seed, progress=watch)
-    except BudgetSpent:
-        watch.stopped = "budget"
-    except KeyboardInterrupt:
-        watch.stopped = "interrupted"
-        if watch.best is not None:
-            watch("best so far", 0, 1, None)
-    return None if watch.best is None else Proposals(watch.best.plan)
+def _best_spot(job: Job, rows: int, seed: int, watch: Watch) -> Receiver:
+    """Of the best few spots that with which the greedy plan costs least a tonne.
+
+    Raises:
+        InputError: If there is no spot.
+    """
+    greedy, best, least = planner_of("greedy", job.world), None, math.inf
+    for number, receiver in enumerate(best_spots(job, seed=seed, watch=watch)):
+        watch("truck", number, TRIED, None if best is None else least)
+        at, quiet = at_receiver(job, receiver), Watch()
+        result = choose(at, greedy.propose(at, rows, seed=seed, progress=quiet))
+        watch.spend(int(quiet.spent))
+        cost = float(result.cost) / max(float(result.rollout.performance.mass.sum()), 1e-3)
+        if best is None or cost < least:
+            best, least = receiver, cost
+    if best is None:
+        raise InputError("there is no place for a truck beside this pile: name one with --truck.")
+    return best
 
 
 def _price(parts: Sequence[PlanResult]) -> float:

@@ -20,6 +20,7 @@ from wlplan.planning.search import Cusps
 from wlplan.planning.transport import transport
 from wlplan.planning.way import cusps_to, unseen_along
 from wlplan.planning.yard import packed_soil
+from wlplan.site.receiver import Receiver
 from wlplan.terrain.characteristics import characteristics
 from wlplan.terrain.heightmap import sample_local
 from wlplan.types import Characteristics, LoadingPlan, Performance, Rollout, SolveReport
@@ -66,6 +67,7 @@ class PlanResult(struct.PyTreeNode):
     ways: Ways | None = None  # leaves (N, ...); None: nobody asked for them
     solves: SolveReport | None = None  # leaves (N,); None: the world does not say
     refereed: PlanResult | None = None  # the same plan played by the referee, if there was one
+    receiver: Receiver | None = None  # where the loader dumps; None: at that of the site
     # Loadings that were evaluated to find it, and what ended that early: "", "budget" or
     # "interrupted".
     spent: float = struct.field(pytree_node=False, default=0.0)

@@ -5,6 +5,8 @@ So one place stops any planner, by a budget or by Ctrl-C, and nothing of what wa
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +55,16 @@ class Watch:
         """How far a stage is, as `Progress`."""
         if self._progress is not None:
             self._progress(stage, done, total, cost)
+
+    @contextlib.contextmanager
+    def ending(self) -> Iterator[None]:
+        """A block that a budget or Ctrl-C ends early, which is then in `stopped`."""
+        try:
+            yield
+        except BudgetSpent:
+            self.stopped = "budget"
+        except KeyboardInterrupt:
+            self.stopped = "interrupted"
 
     def keep(self, plan: Decisions | LoadingPlan, cost: float) -> None:
         """Remembers a plan if it is better than those before.
