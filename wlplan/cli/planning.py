@@ -116,8 +116,7 @@ def plan(
     goal = objective_of(objective_named(objective))
     chosen = planner_named(planner)
     in_simulator = world_name == "simulator"
-    placed = None if truck == AUTO else truck
-    place = site.with_receiver(named, placed)
+    place = site.with_receiver(named, truck if isinstance(truck, tuple) else None)
     with Progress() as progress:
         with Stopwatch() as planning:
             planned = ready(

@@ -79,6 +79,8 @@ def best_spots(
     bound = each[:, :_BEST].mean(axis=1) + metre * truck
     order = np.argsort(bound)[:_SPOTS]
     order = order[np.isfinite(bound[order])]
+    if not len(order):
+        return []
     rows = np.resize(order, (-(-len(order) // _PORTION), _PORTION))
     found = _costs_of_spots(
         job,
