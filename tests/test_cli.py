@@ -22,12 +22,14 @@ from wlplan.errors import InputError
 from wlplan.io.upright import TURNS
 from wlplan.planning import objective
 from wlplan.planning import plan as planner
+from wlplan.planning.amounts import Loads, amount_fields
 from wlplan.planning.loading import Transport
 from wlplan.planning.playing import PlanResult
 from wlplan.report import figures as plots
 from wlplan.report import page as report
 from wlplan.site.frame import Frame
 from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.site import Site
 from wlplan.site.soil import GRAVEL, SAND, Soil
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
@@ -53,7 +55,9 @@ class FakeWorld:
         return pile, performance
 
 
-def fake_play(world: FakeWorld, pile: Pile, plan: LoadingPlan, **_: object) -> PlanResult:
+def fake_play(
+    world: FakeWorld, pile: Pile, plan: LoadingPlan, site: Site | None = None, **_: object
+) -> PlanResult:
     count = len(plan.pose.x)
     mass = jnp.asarray(world.factor * np.linspace(1.0, 3.0, count), jnp.float32)
     height = np.asarray(pile.height, np.float64)
@@ -65,6 +69,7 @@ def fake_play(world: FakeWorld, pile: Pile, plan: LoadingPlan, **_: object) -> P
         rollout=Rollout(performance, after),
         transport=Transport(jnp.full(count, 20.0), jnp.full(count, 100.0)),
         terms={},
+        receiver=None if site is None else site.receiver,
         costs=jnp.full(count, 1.0),
         cost=jnp.asarray(float(count)) / world.factor,
     )
@@ -97,9 +102,15 @@ def fakes(
     """Stand-ins for what takes long; the pile and the files are real."""
 
     def plan_loads(
-        world: FakeWorld, pile: Pile, *, loads: int, progress: Callable[..., None], **options: Any
+        world: FakeWorld,
+        pile: Pile,
+        *,
+        amount: Any,
+        progress: Callable[..., None],
+        **options: Any,
     ) -> PlanResult:
-        calls.append({"loads": loads, **options})
+        loads = amount.count if isinstance(amount, Loads) else 2
+        calls.append({"loads": loads, "amount": amount, **options})
         pose = edge_poses(toe_contour(pile), loads)
         plan = LoadingPlan(
             Pose(*(jnp.asarray(v, jnp.float32) for v in (pose.x, pose.y, pose.heading))),
@@ -107,7 +118,7 @@ def fakes(
         )
         for done in range(loads):
             progress("steps", done + 1, loads, 3.0)
-        return fake_play(world, pile, plan)
+        return fake_play(world, pile, plan, options["site"])
 
     def load_world(
         name: str,
@@ -237,6 +248,84 @@ def test_the_options_reach_the_planner(run: Run, scan: str, calls: list[dict[str
     assert float(receiver.x) == -10.0
     # Without a heading the one that suits: the truck does not stand between loader and pile.
     assert math.cos(float(receiver.heading)) < 0.9
+
+
+@pytest.mark.parametrize(
+    ("options", "amount", "objective_name"),
+    [
+        ((), {"amount": "loads", "count": 15}, "efficiency"),
+        (("--tonnes", 80), {"amount": "tonnes", "mass": 80.0}, "delivery"),
+        (
+            ("--trucks", 2, "--payload", 24, "--exchange", 40),
+            {"amount": "trucks", "count": 2, "payload": 24.0, "exchange": 40.0}
+            | {"tolerance": 0.05, "limit": 1.1},
+            "delivery",
+        ),
+        (("--empty",), {"amount": "empty", "remaining": 0.02, "least": 0.8}, "delivery"),
+        (
+            ("--empty", "--remaining", 10, "--objective", "energy"),
+            {"amount": "empty", "remaining": 0.1, "least": 0.8},
+            "energy",
+        ),
+    ],
+)
+def test_an_amount_reaches_the_planner_and_the_plan(
+    run: Run,
+    scan: str,
+    calls: list[dict[str, Any]],
+    options: tuple[Any, ...],
+    amount: dict[str, Any],
+    objective_name: str,
+) -> None:
+    code, out, _ = run("plan", scan, *options, "--json")
+    assert code == 0
+    assert amount_fields(calls[0]["amount"]) == amount
+    document = json.loads(out)
+    assert document["job"] == amount
+    assert document["objective"] == objective_name
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--loads", 2, "--tonnes", 9), "--loads and --tonnes do not go together"),
+        (("--trucks", 2), "--trucks K and --payload T go together"),
+        (("--payload", 20), "--trucks K and --payload T go together"),
+        (("--exchange", 20), "--exchange goes with --trucks"),
+        (("--remaining", 20), "--remaining goes with --empty"),
+        (("--tonnes", "nan"), "--tonnes"),
+        (("--trucks", 0, "--payload", 9), "--trucks"),
+    ],
+)
+def test_amounts_that_do_not_go_together_are_one_line(
+    run: Run, scan: str, options: tuple[Any, ...], told: str
+) -> None:
+    code, out, err = run("plan", scan, *options)
+    assert (code, out) == (2, "")
+    assert told in err
+    assert err.count("\n") == 1
+
+
+def test_a_truck_may_be_left_to_the_planner(
+    run: Run, scan: str, calls: list[dict[str, Any]]
+) -> None:
+    assert run("plan", scan, "--loads", 1, "--truck", "auto")[0] == 0
+    assert run("plan", scan, "--loads", 1)[0] == 0
+    assert [call["truck"] for call in calls] == ["auto", None]
+
+
+def test_an_interrupted_search_is_shown_written_and_told(
+    run: Run, scan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = planner.plan_loads
+    monkeypatch.setattr(
+        planner, "plan_loads", lambda *a, **o: whole(*a, **o).replace(stopped="interrupted")
+    )
+    code, out, err = run("plan", scan, "--loads", 2, "--out", tmp_path / "out")
+    assert code == 130
+    assert "2 loads from" in out
+    assert "note: the search was ended early, by hand: this is the best by then" in err
+    assert (tmp_path / "out" / "plan.json").exists()
 
 
 def test_without_a_pile_the_bundled_one_is_planned(run: Run) -> None:

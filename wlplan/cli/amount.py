@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import TYPE_CHECKING, Any
 
 import click
 
 if TYPE_CHECKING:
     from wlplan.planning.amounts import Amount
+
+
+class FiniteRange(click.FloatRange):
+    """A number in a range; NaN is in none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number of a text."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number", param, ctx)
+        return number
+
 
 _MOST_LOADS, _MOST_TONNES, _MOST_TRUCKS = 500, 2_000.0, 50
 _DEFAULT = 15
@@ -69,7 +82,7 @@ _OPTIONS = (
     ),
     click.option(
         "--tonnes",
-        type=click.FloatRange(0.0, _MOST_TONNES, min_open=True),
+        type=FiniteRange(0.0, _MOST_TONNES, min_open=True),
         default=None,
         help="Tonnes to be loaded, in as many loads as it takes.",
     ),
@@ -81,14 +94,14 @@ _OPTIONS = (
     ),
     click.option(
         "--payload",
-        type=click.FloatRange(1.0, 500.0),
+        type=FiniteRange(1.0, 500.0),
         default=None,
         help="Payload of a truck [t]: it is met to 5 % where that can be done, and never "
         "exceeded by more than 10 %.",
     ),
     click.option(
         "--exchange",
-        type=click.FloatRange(0.0, 3600.0),
+        type=FiniteRange(0.0, 3600.0),
         default=None,
         help="How long the loader waits from one truck to the next [s]. Default: 30.",
     ),
@@ -99,7 +112,7 @@ _OPTIONS = (
     ),
     click.option(
         "--remaining",
-        type=click.FloatRange(0.0, 99.0),
+        type=FiniteRange(0.0, 99.0),
         default=None,
         help="With --empty: part of the volume that may remain [%]. Default: 2.",
     ),

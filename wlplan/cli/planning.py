@@ -190,7 +190,7 @@ def plan(
         print("; ".join(f"{name} {text}" for name, text in seconds.items()))
         _print_written(folder, written)
     if planned.stopped == "interrupted":
-        raise SystemExit(_INTERRUPTED)
+        raise click.exceptions.Exit(_INTERRUPTED)
 
 
 def _print_written(folder: Path | None, written: list[str] | None) -> None:
