@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_planner import SITE, bowl_world, cone
+from cones import SITE, bowl_world, cone
 
 import wlplan
 from wlplan.errors import InputError

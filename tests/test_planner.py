@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.typing import DTypeLike
+from cones import BEST_ACTION, SITE, bowl_world, circle, cone
 from laws import assert_gradient
 
 import wlplan
@@ -19,14 +19,10 @@ from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.planners import Gradient, Greedy, Nominal
 from wlplan.planning.playing import PlanResult
 from wlplan.planning.poses import distance_to_toe, pose_at, toe_of
-from wlplan.site.receiver import Receiver
-from wlplan.site.site import Site
 from wlplan.terrain.excavation import excavate
-from wlplan.terrain.toe import TOE_RISE, ToeContour, toe_contour
+from wlplan.terrain.toe import TOE_RISE, toe_contour
 from wlplan.types import Action, Performance, Pile, Pose, action_vector
 
-BEST_ACTION = np.array([0.3, 2.0, 0.5, 3.5])
-SITE = Site(receiver=Receiver(jnp.float32(-12.5), jnp.float32(4.0), jnp.float32(1.3)))
 GREEDY = Greedy(actions=12, refine_steps=40, refined=4, poses_per_metre=0.5)
 NOMINAL = Nominal(actions=12, refine_steps=40, rows=2)
 GRADIENT = Gradient(
@@ -37,33 +33,6 @@ GRADIENT = Gradient(
     greedy=GREEDY,
     nominal=NOMINAL,
 )
-
-
-def cone(dtype: DTypeLike = jnp.float32, radius: float = 5.0, cells: int = 161) -> Pile:
-    x = 0.1 * np.arange(cells) - 8.0
-    height = np.maximum(0.5 * (radius - np.hypot(x[:, None], x[None, :])), 0.0)
-    return Pile(jnp.asarray(height, dtype), 0.1, (-8.0, -8.0))
-
-
-def bowl_world(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
-    """The load falls with the distance of the action from the best one; digging is real."""
-    part = (action_vector(action) - BEST_ACTION) / np.array([0.7, 5.0, 0.7, 5.0])
-    mass = 3.0 / (1.0 + 4.0 * (part**2).sum())
-    after, volume = excavate(pile, pose, mass / 1.7, width=2.7)[:2]
-    mass = 1.7 * volume
-    return after, Performance(mass=mass, time=9.0 + mass, work=300.0 + 20.0 * mass)
-
-
-def circle(radius: float = 4.7, n: int = 290) -> ToeContour:
-    """The toe of the cone where it rises by TOE_RISE."""
-    angle = 2 * np.pi * np.arange(n) / n
-    return ToeContour(
-        points=radius * np.stack([np.cos(angle), np.sin(angle)], axis=1),
-        heading=angle - np.pi,
-        length=2 * np.pi * radius,
-        closed=True,
-        accessible=np.ones(n, bool),
-    )
 
 
 def test_squashing_stays_in_the_box_and_is_inverted() -> None:

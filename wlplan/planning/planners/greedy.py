@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import ClassVar
 
 import jax
 import numpy as np
 
-from wlplan.planning.amounts import Loads, Trucks
-from wlplan.planning.job import Job, beginning, padded, stacked
-from wlplan.planning.load_search import LoadSearch
+from wlplan.planning.amounts import Loads, Outlook, Trucks
+from wlplan.planning.job import Decisions, Job, Standing, beginning, padded, stacked
+from wlplan.planning.load_search import LoadSearch, Tried
 from wlplan.planning.proposals import NothingWorthIt, Progress, Proposals
 from wlplan.planning.stepping import advance
-from wlplan.planning.watch import watching
+from wlplan.planning.watch import Watch, watching
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +24,8 @@ class Greedy(LoadSearch):
     What a loading leaves to do is judged by what loads are like now: buckets to fill the truck
     with, or tonnes. In a world without a derivative nothing is refined.
     """
+
+    stage: ClassVar[str] = "greedy"  # as progress has it
 
     @classmethod
     def by_trial(cls) -> Greedy:
@@ -44,16 +47,14 @@ class Greedy(LoadSearch):
                 # A truck is filled as it was begun.
                 outlook, known = self.outlook(job, standing, tried, watch)
                 tried = self.attempt(job, standing, random, watch, known=known)
-            found = self.best(job, standing, tried, outlook, watch)
-            best = int(np.argmin(found.scores))
-            decision = jax.tree.map(lambda leaf, b=best: leaf[b], found.decisions)
+            decision, score = self.choose(job, standing, tried, outlook, loads - load, watch)
             after, truck = _advance(job, standing, decision, outlook)
             if not job.amount.is_worth(float(after.done.mass - standing.done.mass)):
                 break
             standing = after
             chosen.append(decision.replace(truck=truck))
             watch.keep(padded(chosen, loads), -math.inf)
-            watch("greedy", load + 1, loads, float(found.scores[best]))
+            watch(self.stage, load + 1, loads, score)
             watch.spend(1)
             if job.amount.is_done(standing.done):
                 break
@@ -63,6 +64,31 @@ class Greedy(LoadSearch):
         if not isinstance(job.amount, Loads):
             plan = padded(chosen, loads)
         return Proposals(jax.tree.map(lambda leaf: leaf[None], plan))
+
+    def choose(
+        self,
+        job: Job,
+        standing: Standing,
+        tried: Tried,
+        outlook: Outlook,
+        left: int,
+        watch: Watch,
+    ) -> tuple[Decisions, float]:
+        """The next load, and its score.
+
+        Args:
+            job: With its toe.
+            standing: Before the load.
+            tried: Loads that could be made.
+            outlook: What the loads after it will be like.
+            left: Most loads that are to be made, this one included.
+            watch: Told what it took.
+        """
+        del left
+        found = self.best(job, standing, tried, outlook, watch)
+        best = int(np.argmin(found.scores))
+        decision: Decisions = jax.tree.map(lambda leaf: leaf[best], found.decisions)
+        return decision, float(found.scores[best])
 
 
 _advance = jax.jit(advance)
