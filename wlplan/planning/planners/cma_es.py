@@ -1,0 +1,94 @@
+"""CMA-ES over all loadings at once, by the library pycma."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from wlplan.planning.job import Job
+from wlplan.planning.planners.greedy import Greedy
+from wlplan.planning.population import (
+    PER_LOAD,
+    Near,
+    Pool,
+    Spread,
+    evenly_spread,
+    plan_to_start_at,
+    spread_of_all,
+)
+from wlplan.planning.proposals import Planner, Progress, Proposals
+from wlplan.planning.watch import watching
+
+_GREEDY, _SPREAD = Greedy(), Spread()
+# What a plan without a finite cost counts: pycma ranks numbers only.
+_WORST = 1e12
+
+
+@dataclasses.dataclass(frozen=True)
+class CmaEs:
+    """Evolves a normal distribution of plans: mean, step length and covariance.
+
+    pycma (Hansen, Akimoto and Baudis 2019, DOI 10.5281/zenodo.2559634) draws the plans and is told
+    their costs. Trucks are those of the plan that it starts at.
+    """
+
+    # Plans drawn in an iteration, and iterations.
+    population: int = 16
+    iterations: int = 32
+    # Whether the covariance is held diagonal: that has less to learn, but no ties between loads.
+    diagonal: bool = False
+    # Whose plan it starts at, and the first deviation there. None: anywhere on the toe.
+    start: Planner | None = _GREEDY
+    spread: Spread = _SPREAD
+    # How many plans are handed on.
+    candidates: int = 16
+
+    @classmethod
+    def by_trial(cls) -> CmaEs:
+        """The default in worlds without a derivative, where a trial takes long: fewer of them."""
+        return cls(population=12, iterations=8, start=Greedy.by_trial())
+
+    def propose(
+        self, job: Job, loads: int, *, seed: int, progress: Progress | None = None
+    ) -> Proposals:
+        """The cheapest plans, leaves [K, N]; arguments as of `Planner.propose`.
+
+        The limit is the plan that it starts at, if another planner made that.
+
+        Raises:
+            InputError: If that planner plans fixed poses.
+        """
+        # Its import takes a second.
+        import cma
+
+        watch = watching(progress)
+        limit, spread = None, self.spread
+        if self.start is None:
+            first, spread = evenly_spread(job, loads), spread_of_all(job)
+        else:
+            limit = first = plan_to_start_at(self.start, job, loads, seed=seed, watch=watch)
+        near, pool = Near(job, first, spread), Pool(job, watch, self.candidates)
+        random = np.random.default_rng([seed, 1])
+        strategy = cma.CMAEvolutionStrategy(
+            np.zeros(near.loads * PER_LOAD),
+            1.0,
+            {
+                "popsize": self.population,
+                "CMA_diagonal": self.diagonal,
+                # Random numbers of its own, and nothing printed or written.
+                "seed": np.nan,
+                "randn": lambda *shape: random.standard_normal(shape),
+                "verbose": -9,
+                "verb_log": 0,
+                "verb_disp": 0,
+            },
+        )
+        for number in range(self.iterations):
+            drawn = strategy.ask()
+            # The mean is better than most of them: with it they are played, and not told of it.
+            numbers = np.reshape([strategy.mean, *drawn], (-1, near.loads, PER_LOAD))
+            costs = pool.play(near.plans(numbers))[1:]
+            strategy.tell(drawn, np.minimum(costs, _WORST).tolist())
+            watch("cma-es", number + 1, self.iterations, pool.least)
+        return Proposals(pool.cheapest(), limit=limit)
