@@ -275,3 +275,18 @@ def test_coloured_noise_has_variance_one_and_neighbours_alike() -> None:
     for noise, alike in ((white, 0.0), (red, 0.6)):
         assert noise.var() == pytest.approx(1.0, abs=0.05)
         assert (noise[:, 1:] * noise[:, :-1]).mean() == pytest.approx(alike, abs=0.15)
+
+
+def test_a_tree_needs_no_compiling_on_another_pile(caplog: pytest.LogCaptureFixture) -> None:
+    """However long the toe is, and however many rows of loads go on."""
+
+    def compilations(radius: float) -> list[str]:
+        caplog.clear()
+        with jax.log_compiles():
+            plan_loads(
+                spoilt_world, cone(radius=radius), loads=2, planner=TREE, objective=GOAL, site=SITE
+            )
+        return [r.getMessage() for r in caplog.records if "XLA compilation" in r.getMessage()]
+
+    compilations(5.0)
+    assert not compilations(3.0)

@@ -124,7 +124,7 @@ class TreeSearch(Greedy):
                 watch.spend(costs.size)
                 costs, masses = self._costs(job, node.standing, poses, tried.cusps, tried.actions)
             at = jax.tree.map(lambda leaf: np.asarray(leaf), (poses, tried.cusps, costs, masses))
-            standing = jax.tree.map(np.asarray, node.standing)
+            standing = _packed(node.standing)
             parts += [(standing, jax.tree.map(lambda leaf, r=row: leaf[r], at)) for row in rows]
         watch.spend(steps * count * len(nodes), steps * count * len(nodes))
         refine = _refinement(steps, self.refine_rate, self.refine_poses)
@@ -167,16 +167,34 @@ class TreeSearch(Greedy):
     ) -> tuple[list[_Node], list[bool]]:
         """The nodes that children are, and whether the job is done there."""
         watch.spend(len(kept))
-        rows = [(child.parent.standing, child.decision, np.asarray(child.score)) for child in kept]
+        rows = [
+            (_packed(child.parent.standing), child.decision, np.asarray(child.score))
+            for child in kept
+        ]
         together = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
         found = jax.tree.map(np.asarray, _followed((job, outlook), together))
         nodes = []
         for k, child in enumerate(kept):
-            standing, cost, later, _ = jax.tree.map(lambda leaf, k=k: leaf[k], found)
-            digs = (*child.parent.digs, child.dig)
+            packed, cost, later, _ = jax.tree.map(lambda leaf, k=k: leaf[k], found)
+            standing, digs = _unpacked(job, packed), (*child.parent.digs, child.dig)
             cost = child.parent.cost + float(cost)
             nodes.append(_Node(standing, cost, float(later), digs, child.first))
         return nodes, found[-1].tolist()
+
+
+_Packed = tuple[Any, Done]
+"""A standing as the heights of its pile and what is done: all that differs within a job."""
+
+
+def _packed(standing: Standing) -> _Packed:
+    # Of numpy, which is stacked and shared out without a program for each number of rows.
+    packed: _Packed = jax.tree.map(np.asarray, (standing.pile.height, standing.done))
+    return packed
+
+
+def _unpacked(job: Job, packed: _Packed) -> Standing:
+    height, done = packed
+    return Standing(job.pile.replace(height=height), done)
 
 
 _At = tuple[Any, Any, Array, Array]
@@ -194,10 +212,10 @@ def _refinement(steps: int, rate: float, poses: bool) -> ParallelMap:
     """
 
     def refine(
-        shared: tuple[Job, Outlook, Float[Array, "a 4"]], row: tuple[Standing, _At]
+        shared: tuple[Job, Outlook, Float[Array, "a 4"]], row: tuple[_Packed, _At]
     ) -> tuple[Decisions, Float[Array, " p"]]:
-        (job, outlook, actions), (standing, at) = shared, row
-        place, cusps, costs, masses = at
+        (job, outlook, actions), (packed, at) = shared, row
+        standing, (place, cusps, costs, masses) = _unpacked(job, packed), at
         scores = jax.vmap(
             jax.vmap(lambda cost, mass: score_of(job, standing, cost, mass, outlook))
         )(costs, masses)
@@ -238,16 +256,18 @@ def _cost_of_later(job: Job, done: Done, outlook: Outlook) -> Float[Array, ""]:
 
 
 def _follow_one(
-    shared: tuple[Job, Outlook], row: tuple[Standing, Decisions, Float[Array, ""]]
-) -> tuple[Standing, Array, Array, Array]:
+    shared: tuple[Job, Outlook], row: tuple[_Packed, Decisions, Float[Array, ""]]
+) -> tuple[_Packed, Array, Array, Array]:
     """Where a load leaves the job, its cost, that of later trucks, and whether the job is done."""
-    (job, outlook), (before, decision, score) = shared, row
+    (job, outlook), (packed, decision, score) = shared, row
+    before = _unpacked(job, packed)
     after, _ = advance(job, before, decision, outlook)
     amount, mass = job.amount, after.done.mass - before.done.mass
     stays = amount.step(before.done, mass, jnp.zeros((), bool)).done
     leaves = after.done.trucks > before.done.trucks
     cost = score - amount.to_go(stays, outlook) + amount.step(before.done, mass, leaves).cost
-    return after, cost, _cost_of_later(job, after.done, outlook), amount.is_done(after.done)
+    follows = after.pile.height, after.done
+    return follows, cost, _cost_of_later(job, after.done, outlook), amount.is_done(after.done)
 
 
 _followed = ParallelMap(_follow_one)
