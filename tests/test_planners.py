@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from cones import SITE, circle, cone, spoilt_world
 
+import wlplan
 from wlplan import Constraint, Objective
 from wlplan.errors import InputError
 from wlplan.planning import planners
 from wlplan.planning.amounts import Loads, Trucks
 from wlplan.planning.job import Decisions, Job, make_job, with_toe
 from wlplan.planning.loading import Loading
-from wlplan.planning.plan import plan_loads
+from wlplan.planning.plan import plan_loads, planner_of
 from wlplan.planning.planners import (
     CmaEs,
     CrossEntropy,
@@ -163,6 +164,13 @@ def nowhere(loading: Loading) -> jax.Array:
     return jnp.nan * loading.performance.mass
 
 
+@pytest.mark.parametrize("name", sorted({*planners.NAMES} - {"gradient"}))
+def test_by_name_nothing_is_refined_where_there_is_no_derivative(name: str) -> None:
+    planner: Any = planner_of(name, wlplan.world(spoilt_world, differentiable=False))
+    for one in (planner, getattr(planner, "start", None)):
+        assert not getattr(one, "refine_steps", 0)
+
+
 def test_what_is_played_is_counted(plans: dict[str, PlanResult]) -> None:
     start = plans["greedy"].spent
     assert plans["random_search"].spent == 16 * 2
@@ -202,7 +210,7 @@ def test_a_tree_sees_what_a_load_spoils(plans: dict[str, PlanResult]) -> None:
 
 def test_a_tree_of_depth_one_chooses_by_cost() -> None:
     """Of the same trials, as greedy does."""
-    few = {**_SEARCH, "refine_steps": 0, "offsets": (0.0,)}
+    few = {**_SEARCH, "refine_steps": 0, "offsets": (0.0,), "neighbours": 1}
     tree, greedy = plan(TreeSearch(depth=1, **few)), plan(Greedy(**few))
     for a, b in zip(jax.tree.leaves(tree.plan), jax.tree.leaves(greedy.plan), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_planner import bowl_world, cone
+from cones import bowl_world, cone
 
 from wlplan.errors import InputError
 from wlplan.planning.job import make_job

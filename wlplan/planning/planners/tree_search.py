@@ -73,11 +73,18 @@ class TreeSearch(Greedy):
     poses_per_metre: float = 1.0
     offsets: tuple[float, ...] = (0.0,)
     actions: int = 12
+    # Poses are further apart than greedy's, so each has ways of its own.
+    neighbours: int = 1
     # Poses that are refined at once; all of them are.
     refined: int = 8
     refine_steps: int = 30
 
     stage: ClassVar[str] = "tree search"
+
+    @classmethod
+    def by_trial(cls) -> TreeSearch:
+        """The default in worlds without a derivative, where a trial takes long: fewer of them."""
+        return cls(width=3, poses_per_metre=0.5, actions=8, refine_steps=0)
 
     def choose(
         self,
