@@ -26,7 +26,7 @@ from wlplan.planning.playing import (
     outcomes,
 )
 from wlplan.planning.proposals import NothingWorthIt, Planner, Progress, Proposals
-from wlplan.planning.spots import TRIED, at_receiver, best_spots
+from wlplan.planning.spots import at_receiver, best_spots
 from wlplan.planning.watch import Watch
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
@@ -145,22 +145,17 @@ def plan_loads(
 
 
 def _best_spot(job: Job, rows: int, seed: int, watch: Watch) -> Receiver:
-    """Of the best few spots that with which the greedy plan costs least a tonne.
-
-    Raises:
-        InputError: If there is no spot.
-    """
-    greedy, best, least = planner_of("greedy", job.world), None, math.inf
-    for number, receiver in enumerate(best_spots(job, seed=seed, watch=watch)):
-        watch("truck", number, TRIED, None if best is None else least)
+    """Of the job's own and the best few spots that with which greedy costs least a tonne."""
+    greedy, best, least = planner_of("greedy", job.world), job.site.placed_receiver, math.inf
+    spots = [best, *best_spots(job, seed=seed, watch=watch)]
+    for number, receiver in enumerate(spots):
+        watch("truck", number, len(spots), None if number == 0 else least)
         at, quiet = at_receiver(job, receiver), Watch()
         result = choose(at, greedy.propose(at, rows, seed=seed, progress=quiet))
         watch.spend(int(quiet.spent))
         cost = float(result.cost) / max(float(result.rollout.performance.mass.sum()), 1e-3)
-        if best is None or cost < least:
+        if cost < least:
             best, least = receiver, cost
-    if best is None:
-        raise InputError("there is no place for a truck beside this pile: name one with --truck.")
     return best
 
 
