@@ -34,9 +34,9 @@ from wlplan.types import Action, Performance, Pile, Pose
 GREEDY = Greedy(actions=8, refine_steps=30, refined=4, poses_per_metre=0.5)
 
 
-def outlook(cost: float = 2.0, mass: float = 3.0, full: float = 3.2, price: float = 0.0) -> Outlook:
-    """Loads of `mass` for `cost`, and of `full` for a tenth more."""
-    return Outlook(*(jnp.float32(v) for v in (cost, mass, 1.1 * cost, full, price)))
+def outlook(spare: float = 0.0, price: float = 0.0) -> Outlook:
+    """Loads of 3 t for 2, and of 3.2 t for a tenth more."""
+    return Outlook(*(jnp.float32(v) for v in (2.0, 3.0, 2.2, 3.2, spare, price)))
 
 
 def after(amount: Amount, *masses: float, leaves: Any = None) -> list[Any]:
@@ -89,6 +89,9 @@ def test_buckets_to_fill_a_truck_are_counted() -> None:
     # With less aboard it takes three, or two and a truck that is a little short.
     cost = float(trucks.to_go(aboard(2.9), outlook()))
     assert cost == pytest.approx(min(3 * 2.0, 2 * 2.2 + MISFIT_COST * 0.2), abs=1e-4)
+    # Of three loads, 9 t, 2.4 t are spared, which counts a little more than it is worth.
+    cost = float(trucks.to_go(aboard(2.9), outlook(spare=0.1)))
+    assert cost == pytest.approx(min(3 * 2.0 - 1.25 * 0.1 * 2.4, 6.4), abs=1e-4)
     # By price it is the tonnes that count.
     assert float(trucks.to_go(aboard(3.0), outlook(price=0.5))) == pytest.approx(3.5)
 

@@ -373,6 +373,23 @@ def test_ground_is_not_dug() -> None:
         assert float(jnp.abs(after - before.height).max()) > 0.1
 
 
+def test_no_soil_is_made_of_what_cannot_be_taken() -> None:
+    """Soil that a change takes from behind a wall stays there, so it is not laid down before it."""
+    before = walled(diagonal=False)
+    pose = Pose(*(jnp.float32(v) for v in (4.0, 6.0, 0.0)))
+    along = 0.1 * np.arange(52) - 1.0
+    take, lay = np.where(along > 2.6, -0.3, 0.0), np.where((along > 0.5) & (along < 1.5), 0.2, 0.0)
+    for part in (0.0, 1.0, 20.0):
+        profile = (take + part * lay).astype(np.float32)
+        change = jnp.asarray(np.repeat(profile[:, None], 52, axis=1))
+        after, missing = add_local_change(before.height, before, pose, change, 1.0)
+        grown = float((after - before.height).sum()) * CELL**2
+        # What lies nowhere comes from nowhere.
+        net = float(change.sum()) * CELL**2
+        assert grown == pytest.approx(max(net, 0.0), abs=1e-3)
+        assert float(missing) == pytest.approx(max(-net, 0.0), abs=1e-3)
+
+
 @pytest.mark.parametrize("name", ["simulator", "low", pytest.param("high", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("where", ["ahead", "beside", "across"])
 def test_no_world_digs_a_wall_or_takes_soil_through_it(name: str, where: str) -> None:

@@ -22,6 +22,8 @@ from .planning.plan import plan_loads as plan_loads
 from .planning.plan import play as play
 from .planning.playing import PlanResult as PlanResult
 from .planning.proposals import Proposals as Proposals
+from .planning.replanning import Replanner as Replanner
+from .planning.replanning import next_load as next_load
 from .planning.rollout import rollout as rollout
 from .report.figures import diggability_figure as diggability_figure
 from .report.figures import plan_figure as plan_figure

@@ -30,6 +30,9 @@ _OVERLOAD_COST = 100.0
 _SMALLEST = 0.35
 # Loads that are planned as one, about, and rows of such a plan: a third more.
 _LOADS_AT_ONCE, _ROWS = 12, 16
+# What is spared of later loads counts so much more than it is worth: full buckets come first, and
+# the last one fits what the scale says by then.
+_FULL_FIRST = 1.25
 # Passes that are considered to fill what is left of a truck.
 _PASSES = 16
 
@@ -65,6 +68,7 @@ class Outlook(NamedTuple):
     mass: Float[Array, ""]  # of it [tonne]
     full_cost: Float[Array, ""]  # of the fullest load that is worth it
     full_mass: Float[Array, ""]  # of it [tonne]
+    spare: Float[Array, ""]  # what a tonne less in a load saves
     # What a tonne that is left counts; 0: loads are counted. So one finds these two loads.
     price: Float[Array, ""]
 
@@ -317,7 +321,9 @@ def _by_passes(rest: Array, count: int, outlook: Outlook) -> Array:
     room = jnp.maximum(outlook.full_mass - outlook.mass, 1e-3)
     fuller = jnp.minimum(short, passes * room)
     dearer = jnp.maximum(outlook.full_cost - outlook.cost, 0.0) / room
-    return passes * outlook.cost + dearer * fuller + MISFIT_COST * (short - fuller)
+    spared = jnp.clip(passes * outlook.mass - rest, 0.0, passes * (1.0 - _SMALLEST) * outlook.mass)
+    loads = passes * outlook.cost - _FULL_FIRST * outlook.spare * spared
+    return loads + dearer * fuller + MISFIT_COST * (short - fuller)
 
 
 def typical_load(site: Site) -> float:

@@ -33,6 +33,13 @@ class Tried(NamedTuple):
     masses: Float[np.ndarray, "p a"]  # [tonne]
 
 
+class Memory(NamedTuple):
+    """What is remembered from load to load."""
+
+    outlook: Outlook | None = None  # None: before the first
+    known: Float[np.ndarray, "k 4"] | None = None  # actions that were good, before squashing
+
+
 class Ranked(NamedTuple):
     """The best of them, each at a pose of its own, in no order."""
 
@@ -61,6 +68,33 @@ class LoadSearch:
     # Candidates that are evaluated at once: bounds the memory.
     batch: int = 256
 
+    def look(
+        self,
+        job: Job,
+        standing: Standing,
+        random: np.random.Generator,
+        watch: Watch,
+        memory: Memory,
+    ) -> tuple[Tried, Memory]:
+        """What could be made next, and what is to be remembered of it for the loads after it.
+
+        A truck is filled as it was begun: the outlook stays the same until it has left.
+
+        Args:
+            job: With its toe.
+            standing: Before the loading.
+            random: As of `attempt`.
+            watch: Told what it took.
+            memory: Of the loads before.
+        """
+        tried = self.attempt(job, standing, random, watch, known=memory.known)
+        if not isinstance(job.amount, Trucks):
+            return tried, memory._replace(outlook=self.outlook(job, standing, tried, watch)[0])
+        if memory.outlook is None or not standing.done.aboard > 0.0:
+            memory = Memory(*self.outlook(job, standing, tried, watch))
+            tried = self.attempt(job, standing, random, watch, known=memory.known)
+        return tried, memory
+
     def attempt(
         self,
         job: Job,
@@ -88,7 +122,8 @@ class LoadSearch:
         actions = spread_actions(self.actions, random, dtype)
         if known is not None:
             # In place of others: what evaluates them is compiled for their number.
-            actions = jnp.concatenate([actions[len(known) :], known])[-self.actions :]
+            kept = np.concatenate([np.asarray(actions)[len(known) :], known])[-self.actions :]
+            actions = jnp.asarray(kept.astype(dtype))
         searched = positions[:: self.neighbours].astype(dtype)
         cusps = _cusps_at(job, standing.pile, searched, batch=self.batch // self.actions)
         of_pose = np.arange(len(poses)) // (self.neighbours * len(self.offsets))
@@ -99,8 +134,11 @@ class LoadSearch:
 
     def outlook(
         self, job: Job, standing: Standing, tried: Tried, watch: Watch
-    ) -> tuple[Outlook, Float[np.ndarray, "2 4"]]:
-        """What loads are like, by those that were tried, and the actions of a good and a full one.
+    ) -> tuple[Outlook, Float[np.ndarray, "k 4"]]:
+        """What loads are like, by those that were tried, and actions to try for the next.
+
+        These are of a full load, of a good one, and two between that and the cheapest: a truck may
+        need a load of any mass.
 
         How many buckets a truck takes hangs on what these two hold, so for trucks the best are
         refined first.
@@ -111,11 +149,13 @@ class LoadSearch:
         good, full = (
             _Load(float(tried.costs.flat[row]), float(tried.masses.flat[row])) for row in rows
         )
+        pose = rows[0] // len(tried.actions)
+        spare = _spare(good, tried.costs[pose], tried.masses[pose])
         if not isinstance(job.amount, Trucks) or not can_refine(job, self.refine_steps):
-            return _outlook(good, full), actions
+            return _outlook(good, full, spare), actions
         loads = []
         for worth in (1.0, _WORTH):
-            priced = _outlook(good, good, price=worth * good.cost / good.mass)
+            priced = _outlook(good, good, spare, price=worth * good.cost / good.mass)
             best = self.best(job, standing, tried, priced, watch)
             row = int(np.argmin(best.scores))
             one = jax.tree.map(lambda leaf, row=row: leaf[row], (best.decisions, best.cusps))
@@ -123,7 +163,9 @@ class LoadSearch:
             watch.spend(1)
             loads.append((_Load(float(cost), float(mass)), np.asarray(one[0].action)))
         (good, first), (full, second) = loads
-        return _outlook(good, full), np.stack([first, second])
+        least = np.asarray(tried.actions)[int(np.argmin(tried.costs[pose]))]
+        between = [first + part * (least - first) for part in (1.0 / 3.0, 2.0 / 3.0)]
+        return _outlook(good, full, spare), np.stack([second, first, *between])
 
     def best(
         self, job: Job, standing: Standing, tried: Tried, outlook: Outlook, watch: Watch
@@ -252,8 +294,17 @@ def _per_tonne(
     return np.where(masses > 0.0, costs / np.maximum(masses, 1e-6), np.inf)
 
 
-def _outlook(good: _Load, full: _Load, price: float = 0.0) -> Outlook:
-    return Outlook(*(floats(np.asarray(number)) for number in (*good, *full, price)))
+def _spare(good: _Load, costs: Float[np.ndarray, " a"], masses: Float[np.ndarray, " a"]) -> float:
+    """What a tonne less in a load saves, by the cheapest load from where the good one is."""
+    cheapest = int(np.argmin(costs))
+    less = good.mass - float(masses[cheapest])
+    if less <= 0.0:
+        return 0.0
+    return min((good.cost - float(costs[cheapest])) / less, good.cost / good.mass)
+
+
+def _outlook(good: _Load, full: _Load, spare: float, price: float = 0.0) -> Outlook:
+    return Outlook(*(floats(np.asarray(number)) for number in (*good, *full, spare, price)))
 
 
 @jax.jit

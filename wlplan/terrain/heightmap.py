@@ -153,7 +153,8 @@ def add_local_change(
 
     The change is interpolated at the cells of the grid. Losses and gains are scaled, each by a
     factor close to one, so that both move exactly the volume that they move in the local frame;
-    no cell is dug below the floor, and nothing changes behind what stands there.
+    no cell is dug below the floor, and nothing changes behind what stands there. Where less can be
+    taken than is to be lost, less is laid down too.
 
     Args:
         height: Surface to change [m].
@@ -187,10 +188,15 @@ def add_local_change(
     lost = area_ratio * jnp.maximum(-change, 0.0).sum()
     gained = area_ratio * jnp.maximum(change, 0.0).sum()
     loss = take(jnp.maximum(-on_grid, 0.0), available, lost)
+    short = lax.stop_gradient(lost - loss.sum())
+    if window.ground is not None:
+        # What could not be taken, in front of a wall or down to a floor, is not laid down either.
+        spared = jnp.clip(short, 0.0, lax.stop_gradient(gained))
+        gained, short = gained - spared, short - spared
     gain = jnp.maximum(on_grid, 0.0)
     total = gain.sum()
     scale = jnp.where(total > 0.0, gained / jnp.where(total > 0.0, total, 1.0), 0.0)
-    missing = lax.stop_gradient(lost - loss.sum()) * window.cell_size**2
+    missing = short * window.cell_size**2
     return lax.dynamic_update_slice(height, surface - loss + scale * gain, start), missing
 
 

@@ -9,9 +9,9 @@ from typing import ClassVar
 import jax
 import numpy as np
 
-from wlplan.planning.amounts import Loads, Outlook, Trucks
+from wlplan.planning.amounts import Loads, Outlook
 from wlplan.planning.job import Decisions, Job, Standing, beginning, padded, stacked
-from wlplan.planning.load_search import LoadSearch, Tried
+from wlplan.planning.load_search import LoadSearch, Memory, Tried
 from wlplan.planning.proposals import NothingWorthIt, Progress, Proposals
 from wlplan.planning.stepping import advance
 from wlplan.planning.watch import Watch, watching
@@ -38,15 +38,11 @@ class Greedy(LoadSearch):
         """One plan, leaves [1, N]; arguments as of `Planner.propose`."""
         watch = watching(progress)
         random = np.random.default_rng(seed)
-        standing, chosen, outlook, known = beginning(job), [], None, None
+        standing, chosen, memory = beginning(job), [], Memory()
         for load in range(loads):
-            tried = self.attempt(job, standing, random, watch, known=known)
-            if not isinstance(job.amount, Trucks):
-                outlook, _ = self.outlook(job, standing, tried, watch)
-            elif outlook is None or not standing.done.aboard > 0.0:
-                # A truck is filled as it was begun.
-                outlook, known = self.outlook(job, standing, tried, watch)
-                tried = self.attempt(job, standing, random, watch, known=known)
+            tried, memory = self.look(job, standing, random, watch, memory)
+            outlook = memory.outlook
+            assert outlook is not None
             decision, score = self.choose(job, standing, tried, outlook, loads - load, watch)
             after, truck = _advance(job, standing, decision, outlook)
             if not job.amount.is_worth(float(after.done.mass - standing.done.mass)):

@@ -1,0 +1,226 @@
+"""The next load after every scan: receding horizon, one load at a time.
+
+A scan is laid into a map of a fixed size, so that one of another extent needs no compiling. What is
+outside it counts as unseen, and is never part of the pile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from wlplan.errors import InputError
+from wlplan.planning.amounts import Amount, Done, Loads, Trucks, nothing_done
+from wlplan.planning.job import Decisions, Job, Standing, decided, make_job, with_toe
+from wlplan.planning.load_search import LoadSearch, Memory
+from wlplan.planning.loading import Transport
+from wlplan.planning.objective import Objective
+from wlplan.planning.search import Cusps
+from wlplan.planning.stepping import next_load as assessed_next
+from wlplan.planning.watch import Watch
+from wlplan.site.receiver import Receiver
+from wlplan.site.site import Site
+from wlplan.types import Action, Performance, Pile, Pose, World
+
+EXTENT = 40.0
+"""Sides of the largest scan, unless another is given [m]."""
+
+_SEARCH = LoadSearch()
+
+
+class NextLoad(NamedTuple):
+    """The load to make next."""
+
+    pose: Pose
+    action: Action
+    performance: Performance  # as the world foresees it
+    transport: Transport
+    cost: Float[Array, ""]
+
+
+class Replanner:
+    """Plans the next load after every scan.
+
+    It remembers what a good action was, how far the job is, and where the truck stands. Call
+    `next_load(pile)` with each scan, and `loaded(mass)` with what the bucket then held.
+
+    Args:
+        world: World to plan in.
+        site: Machine, soil and receiver; without a receiver it has one beside the first pile.
+        objective: As for `wlplan.plan_loads`.
+        amount: How much is to be loaded; None: on and on.
+        search: How next loads are searched for.
+        extent: Sides of the largest scan [m].
+        seed: Of everything random.
+
+    Raises:
+        InputError: At the first scan, as `wlplan.plan_loads`.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        *,
+        site: Site | None = None,
+        objective: str | Objective | Mapping[str, Any] | Callable[..., Any] | None = None,
+        amount: Amount | None = None,
+        search: LoadSearch = _SEARCH,
+        extent: float = EXTENT,
+        seed: int = 0,
+    ):
+        self._world, self._site = world, Site() if site is None else site
+        self._amount = Loads(1) if amount is None else amount
+        self._endless = amount is None
+        self._objective = self._amount.objective if objective is None else objective
+        self._search, self._extent = search, extent
+        self._random = np.random.default_rng(seed)
+        self._done: Done | None = None
+        self._memory = Memory()
+
+    @property
+    def receiver(self) -> Receiver | None:
+        """Where the loader dumps; None before the first scan, if nobody said."""
+        return self._site.receiver
+
+    @property
+    def is_done(self) -> bool:
+        """Whether no further load is wanted."""
+        if self._done is None or self._endless:
+            return False
+        return bool(self._amount.is_done(self._done))
+
+    def next_load(self, pile: Pile, *, receiver: Receiver | None = None) -> NextLoad:
+        """The load to make next.
+
+        Args:
+            pile: The pile as it is, of any extent up to the largest.
+            receiver: Where the loader dumps, if the truck does not stand where it did.
+
+        Raises:
+            InputError: As `wlplan.plan_loads`; if the scan is too large; or if the job is done.
+        """
+        if self.is_done:
+            raise InputError("the job is done: no load is left to plan.")
+        if receiver is not None:
+            self._site = self._site.replace(receiver=receiver)
+        site = self._site
+        if site.keep_out is not None:
+            count = self._count(pile.cell_size)
+            widths = [(0, count - n) for n in pile.height.shape]
+            site = site.replace(keep_out=jnp.asarray(np.pad(np.asarray(site.keep_out), widths)))
+        job = make_job(
+            self._world,
+            self.whole_map(pile),
+            site=site,
+            objective=self._objective,
+            amount=self._amount,
+        )
+        self._site = self._site.replace(receiver=job.site.receiver)
+        job = with_toe(job)
+        done = nothing_done(pile.height.dtype) if self._done is None else self._done
+        self._done = done
+        standing, watch = Standing(job.pile, done), Watch()
+        tried, self._memory = self._search.look(job, standing, self._random, watch, self._memory)
+        outlook = self._memory.outlook
+        assert outlook is not None
+        found = self._search.best(job, standing, tried, outlook, watch)
+        row = int(np.argmin(found.scores))
+        decision: Decisions
+        decision, cusps = jax.tree.map(lambda leaf: leaf[row], (found.decisions, found.cusps))
+        if not isinstance(self._amount, Trucks):
+            self._memory = self._memory._replace(known=np.asarray(decision.action)[None])
+        told: NextLoad = _told(job, standing, decision, cusps)
+        return told
+
+    def loaded(self, mass: float, *, left: bool | None = None) -> bool:
+        """Tells what the last load held.
+
+        Args:
+            mass: By the scale of the loader or the truck [tonne].
+            left: Whether the truck has left; None: it does if no further load would make it better.
+
+        Returns:
+            Whether the truck leaves.
+        """
+        outlook = self._memory.outlook
+        if self._done is None or outlook is None:
+            raise InputError("no load was planned yet: call next_load with a scan first.")
+        if not math.isfinite(mass) or mass < 0.0:
+            raise InputError(f"a load of {mass:g} t was told: give tonnes, zero or more.")
+        number = jnp.asarray(mass, self._done.mass.dtype)
+        stays = self._amount.step(self._done, number, jnp.zeros((), bool)).done
+        if left is None:
+            left = bool(self._amount.should_leave(stays, outlook))
+        self._done = self._amount.step(self._done, number, jnp.asarray(left)).done
+        return left
+
+    def whole_map(self, pile: Pile) -> Pile:
+        """A scan in a map of the full size; what is beyond it is unseen ground.
+
+        Raises:
+            InputError: If it is too large.
+        """
+        count = self._count(pile.cell_size)
+        if max(pile.height.shape) > count:
+            sides = " by ".join(f"{n * pile.cell_size:.1f}" for n in pile.height.shape)
+            raise InputError(
+                f"the scan is {sides} m, and the largest is {self._extent:g} m: give the part "
+                f"around the pile, or a larger extent."
+            )
+        # By numpy: each extent would be compiled for.
+        widths = [(0, count - n) for n in pile.height.shape]
+        height = np.asarray(pile.height)
+        floor = np.zeros_like(height) if pile.ground is None else np.asarray(pile.ground)
+        seen = np.ones(height.shape, bool) if pile.valid is None else np.asarray(pile.valid)
+        ground = np.pad(floor, widths, mode="edge")
+        inside = np.pad(np.ones(height.shape, bool), widths)
+        return Pile(
+            height=jnp.asarray(np.where(inside, np.pad(height, widths), ground)),
+            cell_size=pile.cell_size,
+            origin=pile.origin,
+            ground=jnp.asarray(ground),
+            valid=jnp.asarray(np.pad(seen, widths)),
+        )
+
+    def _count(self, cell: float) -> int:
+        """Cells along each side of the map."""
+        return round(self._extent / cell)
+
+
+def next_load(
+    world: World,
+    pile: Pile,
+    *,
+    site: Site | None = None,
+    objective: str | Objective | Mapping[str, Any] | Callable[..., Any] = "efficiency",
+    extent: float = EXTENT,
+    seed: int = 0,
+) -> NextLoad:
+    """The next load from a pile; what is compiled serves every scan of up to that extent.
+
+    Args:
+        world: World to plan in.
+        pile: The pile as it is.
+        site: Machine, soil and receiver, as for `wlplan.plan_loads`.
+        objective: Likewise.
+        extent: Sides of the largest scan [m].
+        seed: Of everything random.
+
+    Raises:
+        InputError: As `Replanner.next_load`.
+    """
+    planner = Replanner(world, site=site, objective=objective, extent=extent, seed=seed)
+    return planner.next_load(pile)
+
+
+@jax.jit
+def _told(job: Job, standing: Standing, decision: Decisions, cusps: Cusps) -> NextLoad:
+    one = decided(job, standing, decision)
+    found = assessed_next(job, standing, decision, cusps)
+    return NextLoad(one.pose, one.action, found.performance, found.transport, found.cost)
