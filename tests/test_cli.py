@@ -109,7 +109,7 @@ def fakes(
         progress: Callable[..., None],
         **options: Any,
     ) -> PlanResult:
-        loads = amount.count if isinstance(amount, Loads) else 2
+        loads = int(amount.count) if isinstance(amount, Loads) else 2
         calls.append({"loads": loads, "amount": amount, **options})
         pose = edge_poses(toe_contour(pile), loads)
         plan = LoadingPlan(

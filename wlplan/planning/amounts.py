@@ -152,12 +152,12 @@ class Loads(Amount):
     """So many loads, whatever they hold."""
 
     objective: ClassVar[str] = "efficiency"
-    count: int = struct.field(pytree_node=False)
+    count: int | Array
 
     def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
         """All of them."""
         del typical
-        return None if made.loads else (self, self.count)
+        return None if made.loads else (self, int(self.count))
 
     def is_done(self, done: Done) -> Bool[Array, ""]:
         """Once all are made."""
@@ -340,7 +340,7 @@ def check_amount(amount: Amount) -> None:
         InputError: If a number of it is not positive, or there is too much of it.
     """
     if isinstance(amount, Loads):
-        if amount.count < 1:
+        if int(amount.count) < 1:
             raise InputError(f"{amount.count} loads were asked for: ask for at least 1.")
         return
     numbers = {

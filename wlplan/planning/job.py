@@ -25,7 +25,8 @@ from wlplan.terrain.toe import ToeContour, toe_contour
 from wlplan.types import Action, LoadingPlan, Pile, Pose, World
 from wlplan.worlds.capabilities import as_pytree, is_differentiable
 
-_AS_GIVEN = Loads(1)
+# As many loads as a plan has rows.
+_AS_GIVEN = Loads(2**30)
 
 
 @no_type_check

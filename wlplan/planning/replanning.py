@@ -75,8 +75,7 @@ class Replanner:
         seed: int = 0,
     ):
         self._world, self._site = world, Site() if site is None else site
-        self._amount = Loads(1) if amount is None else amount
-        self._endless = amount is None
+        self._amount = Loads(2**30) if amount is None else amount
         self._objective = self._amount.objective if objective is None else objective
         self._search, self._extent = search, extent
         self._random = np.random.default_rng(seed)
@@ -91,9 +90,7 @@ class Replanner:
     @property
     def is_done(self) -> bool:
         """Whether no further load is wanted."""
-        if self._done is None or self._endless:
-            return False
-        return bool(self._amount.is_done(self._done))
+        return self._done is not None and bool(self._amount.is_done(self._done))
 
     def next_load(self, pile: Pile, *, receiver: Receiver | None = None) -> NextLoad:
         """The load to make next.
