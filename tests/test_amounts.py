@@ -164,6 +164,7 @@ def test_a_planner_that_knows_nothing_of_trucks_fills_them() -> None:
     assert mass - float(result.rollout.performance.mass[-1]) < 0.95 * 7.0
 
 
+@pytest.mark.slow
 def test_a_descent_makes_no_truck_worse() -> None:
     nominal = Nominal(actions=4, rows=2, refine_steps=0)
     planner = Gradient(starts=2, iterations=4, candidates=3, greedy=GREEDY, nominal=nominal)
@@ -174,6 +175,7 @@ def test_a_descent_makes_no_truck_worse() -> None:
     assert float(np.sum(better.misfit)) <= 1e-3
 
 
+@pytest.mark.slow
 def test_tonnes_end_with_the_bucket_that_reaches_them() -> None:
     result = plan_loads(bowl_world, cone(), amount=Tonnes(7.0), planner=GREEDY, site=SITE)
     masses = np.asarray(result.rollout.performance.mass)
@@ -182,6 +184,7 @@ def test_tonnes_end_with_the_bucket_that_reaches_them() -> None:
     assert result.plan.truck is None
 
 
+@pytest.mark.slow
 def test_a_pile_is_emptied_of_all_that_is_worth_a_load() -> None:
     pile = cone(radius=4.0)
     result = plan_loads(bowl_world, pile, amount=Empty(0.3), planner=GREEDY, site=SITE)

@@ -70,6 +70,7 @@ def test_a_truck_stands_where_it_may() -> None:
     assert best_spots(job, seed=0, watch=Watch(), allowed=np.zeros_like(allowed)) == []
 
 
+@pytest.mark.slow
 def test_a_plan_says_where_it_has_the_truck() -> None:
     pile: Any = wide_cone()
     west = Site(receiver=Receiver(*(jnp.float32(v) for v in (-9.0, 3.0, 1.2))))
