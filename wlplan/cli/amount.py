@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 import functools
-import math
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from wlplan.cli.values import FiniteRange
+
 if TYPE_CHECKING:
     from wlplan.planning.amounts import Amount
-
-
-class FiniteRange(click.FloatRange):
-    """A number in a range; NaN is in none."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number of a text."""
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value!r} is not a finite number", param, ctx)
-        return number
-
 
 _MOST_LOADS, _MOST_TONNES, _MOST_TRUCKS = 500, 2_000.0, 50
 _DEFAULT = 15

@@ -13,15 +13,10 @@ from click.core import ParameterSource
 
 from wlplan.cli.evaluated import evaluated, print_errors, print_pile_state, print_times
 from wlplan.cli.inputs import check_is_folder, site_named
-from wlplan.cli.options import (
-    PROTOCOLS,
-    ShardNumber,
-    site_options,
-    training_options,
-    with_options,
-)
+from wlplan.cli.options import PROTOCOLS, site_options, training_options, with_options
 from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.progress import Progress, Stopwatch
+from wlplan.cli.values import ShardNumber
 from wlplan.errors import InputError
 from wlplan.training.settings import KINDS
 

@@ -16,7 +16,6 @@ from wlplan.cli.inputs import (
     world_named,
 )
 from wlplan.cli.options import (
-    ActionNumbers,
     PileFile,
     model_options,
     out_option,
@@ -33,6 +32,7 @@ from wlplan.cli.outputs import (
     write_files,
 )
 from wlplan.cli.progress import Progress, Stopwatch, ready
+from wlplan.cli.values import ActionNumbers
 from wlplan.constants import QUANTITIES
 
 _FORMAT = "wlplan.diggability/1"

@@ -23,7 +23,6 @@ from wlplan.cli.inputs import (
     world_named,
 )
 from wlplan.cli.options import (
-    AUTO,
     PileFile,
     engine_option,
     model_options,
@@ -40,6 +39,7 @@ from wlplan.cli.options import (
 from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.plan_table import print_plan, remark_on_ledger
 from wlplan.cli.progress import Progress, Stopwatch, ready
+from wlplan.cli.values import AUTO
 from wlplan.constants import QUANTITIES
 from wlplan.planning.objectives import OBJECTIVES
 

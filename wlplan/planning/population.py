@@ -119,6 +119,28 @@ class Pool:
         return together
 
 
+def start_of(
+    planner: Planner | None, job: Job, loads: int, spread: Spread, *, seed: int, watch: Watch
+) -> tuple[Near, Decisions | None]:
+    """Where a search begins, and the plan that none may cost more than.
+
+    Args:
+        planner: Whose plan it starts at; None: anywhere on the toe, and there is no such plan.
+        job: With its toe.
+        loads: Number of loadings, N.
+        spread: The units near the planner's plan.
+        seed: Of everything random.
+        watch: Told what it took.
+
+    Raises:
+        InputError: If the planner plans fixed poses.
+    """
+    if planner is None:
+        return Near(job, evenly_spread(job, loads), spread_of_all(job)), None
+    plan = plan_to_start_at(planner, job, loads, seed=seed, watch=watch)
+    return Near(job, plan, spread), plan
+
+
 def plan_to_start_at(
     planner: Planner, job: Job, loads: int, *, seed: int, watch: Watch
 ) -> Decisions:

@@ -8,15 +8,7 @@ import numpy as np
 
 from wlplan.planning.job import Job
 from wlplan.planning.planners.greedy import Greedy
-from wlplan.planning.population import (
-    PER_LOAD,
-    Near,
-    Pool,
-    Spread,
-    evenly_spread,
-    plan_to_start_at,
-    spread_of_all,
-)
+from wlplan.planning.population import PER_LOAD, Pool, Spread, start_of
 from wlplan.planning.proposals import Planner, Progress, Proposals
 from wlplan.planning.watch import watching
 
@@ -65,12 +57,8 @@ class CmaEs:
         import cma
 
         watch = watching(progress)
-        limit, spread = None, self.spread
-        if self.start is None:
-            first, spread = evenly_spread(job, loads), spread_of_all(job)
-        else:
-            limit = first = plan_to_start_at(self.start, job, loads, seed=seed, watch=watch)
-        near, pool = Near(job, first, spread), Pool(job, watch, self.candidates)
+        near, limit = start_of(self.start, job, loads, self.spread, seed=seed, watch=watch)
+        pool = Pool(job, watch, self.candidates)
         random = np.random.default_rng([seed, 1])
         strategy = cma.CMAEvolutionStrategy(
             np.zeros(near.loads * PER_LOAD),
