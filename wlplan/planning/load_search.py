@@ -129,7 +129,7 @@ class LoadSearch:
         of_pose = np.arange(len(poses)) // (self.neighbours * len(self.offsets))
         cusps = jax.tree.map(lambda leaf: leaf[of_pose], cusps)
         costs, masses = self._costs(job, standing, poses, cusps, actions)
-        watch.spend(costs.size)
+        watch.spend(look=costs.size, quick_way=len(searched))
         return Tried(poses, cusps, actions, costs, masses)
 
     def outlook(
@@ -160,7 +160,7 @@ class LoadSearch:
             row = int(np.argmin(best.scores))
             one = jax.tree.map(lambda leaf, row=row: leaf[row], (best.decisions, best.cusps))
             cost, mass = _cost_and_mass(job, standing, *one)
-            watch.spend(1)
+            watch.spend(look=1)
             loads.append((_Load(float(cost), float(mass)), np.asarray(one[0].action)))
         (good, first), (full, second) = loads
         least = np.asarray(tried.actions)[int(np.argmin(tried.costs[pose]))]
@@ -191,7 +191,7 @@ class LoadSearch:
         if not can_refine(job, self.refine_steps):
             return Ranked(starts, cusps, scores.min(axis=1)[rows])
         count = self.refine_steps * len(rows)
-        watch.spend(count, count)
+        watch.spend(look_gradient=count)
         decisions, refined = _refine(
             job,
             standing,

@@ -76,7 +76,7 @@ def plan_loads(
             it dug at. A candidate that costs more in `world` than the planner's limit, for the
             gradient planner the greedy plan, is out. None: `world` picks, with its own poses.
         progress: Called as the planner advances.
-        budget: Most loadings that a planner of ours may evaluate, see `wlplan.planning.watch`.
+        budget: Most that a search may spend, in loadings, see `wlplan.planning.watch.EFFORTS`.
         contour: The toe to dig along; default: that of the pile.
 
     Returns:
@@ -152,7 +152,7 @@ def _best_spot(job: Job, rows: int, seed: int, watch: Watch) -> Receiver:
         watch("truck", number, len(spots), None if number == 0 else least)
         at, quiet = at_receiver(job, receiver), Watch()
         result = choose(at, greedy.propose(at, rows, seed=seed, progress=quiet))
-        watch.spend(int(quiet.spent))
+        watch.spend(loading=quiet.spent)
         cost = float(result.cost) / max(float(result.rollout.performance.mass.sum()), 1e-3)
         if cost < least:
             best, least = receiver, cost

@@ -68,8 +68,8 @@ class PlanResult(struct.PyTreeNode):
     solves: SolveReport | None = None  # leaves (N,); None: the world does not say
     refereed: PlanResult | None = None  # the same plan played by the referee, if there was one
     receiver: Receiver | None = None  # where the loader dumps; None: at that of the site
-    # Loadings that were evaluated to find it, and what ended that early: "", "budget" or
-    # "interrupted".
+    # What was evaluated to find it, in loadings, see `watch.EFFORTS`; and what ended that early:
+    # "", "budget" or "interrupted".
     spent: float = struct.field(pytree_node=False, default=0.0)
     stopped: str = struct.field(pytree_node=False, default="")
 

@@ -98,7 +98,7 @@ class Pool:
 
     def play(self, plans: Decisions) -> Float[np.ndarray, " k"]:
         """Costs of plans, leaves [K, N]; infinite where there is none."""
-        self._watch.spend(plans.position.size)
+        self._watch.spend(loading=plans.position.size, way=plans.position.size)
         costs = np.asarray(outcomes(self._job, plans).cost, np.float64)
         costs = np.nan_to_num(costs, nan=np.inf, posinf=np.inf)
         order = np.argsort(costs, kind="stable")[: self._size]

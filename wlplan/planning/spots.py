@@ -59,7 +59,7 @@ def best_spots(
     costs, longer, masses = (
         np.asarray(leaf, float) for leaf in _yields((job, actions), jnp.asarray(poses, dtype))
     )
-    watch.spend(costs.size)
+    watch.spend(look=costs.size)
     per_tonne = np.where(masses > 0.0, costs / np.maximum(masses, 1e-3), np.inf)
     best = per_tonne.argmin(axis=1)
     value = per_tonne.min(axis=1)
@@ -91,7 +91,7 @@ def best_spots(
         ),
     )
     cost, mass = (np.asarray(leaf, float).reshape(-1, _LOOKED_AT)[: len(order)] for leaf in found)
-    watch.spend(cost.size)
+    watch.spend(look=cost.size, quick_way=cost.size)
     each = np.sort(np.where(mass > 0.0, cost / np.maximum(mass, 1e-3), np.inf), axis=1)
     scores = each[:, :_BEST].mean(axis=1) + metre * truck[order]
     chosen: list[np.ndarray] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -60,19 +62,37 @@ def score_of(
     return cost + job.amount.to_go(after, outlook)
 
 
-def advance(
-    job: Job, standing: Standing, decisions: Decisions, outlook: Outlook
-) -> tuple[Standing, Int[Array, ""]]:
-    """Where a loading leaves the job, and the truck that it went to.
+class Advanced(NamedTuple):
+    """A loading that was made."""
 
-    The truck leaves when no further load would make it better.
+    standing: Standing  # after it
+    truck: Int[Array, ""]  # that it went to
+    cost: Float[Array, ""]  # of it, what the truck that leaves is off by included; no wait
+
+
+def advance(
+    job: Job,
+    standing: Standing,
+    decisions: Decisions,
+    outlook: Outlook,
+    score: Float[Array, ""] | float,
+) -> Advanced:
+    """Makes a loading. The truck leaves when no further load would make it better.
+
+    Args:
+        job: World, amount and toe.
+        standing: Before the loading.
+        decisions: Of the loading.
+        outlook: As of `score_of_next`.
+        score: What `score_of_next` has of it.
     """
     one = decided(job, standing, decisions)
     after, performance = job.world(standing.pile, one.pose, one.action)
-    stays = job.amount.step(standing.done, performance.mass, jnp.zeros((), bool)).done
-    leaves = job.amount.should_leave(stays, outlook)
-    done = job.amount.step(standing.done, performance.mass, leaves).done
-    return Standing(after, done), standing.done.trucks
+    amount, mass = job.amount, performance.mass
+    stays = amount.step(standing.done, mass, jnp.zeros((), bool)).done
+    step = amount.step(standing.done, mass, amount.should_leave(stays, outlook))
+    cost = score - amount.to_go(stays, outlook) + step.cost
+    return Advanced(Standing(after, step.done), standing.done.trucks, cost)
 
 
 def cusps_of_next(job: Job, pile: Pile, position: Array, offset: Array) -> Cusps:

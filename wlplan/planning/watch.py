@@ -15,9 +15,18 @@ from wlplan.planning.job import Decisions
 from wlplan.planning.proposals import Progress
 from wlplan.types import LoadingPlan
 
-GRADIENT_COST = 4.0
-"""Loadings that a loading with its gradient counts for: what it takes longer, measured by
-`wlplan bench`."""
+EFFORTS = {
+    "loading": 1.0,
+    "gradient": 4.0,
+    "look": 1.0 / 60.0,
+    "look_gradient": 0.25,
+    "way": 0.7,
+    "quick_way": 0.3,
+}
+"""What evaluations count, in loadings whose pile is predicted too: such a loading; the same and its
+gradient; one whose pile is not, at a pose where others are looked at as well; such a one alone and
+its gradient; the search of a way, and that of one that need not be the best. By the time they take,
+which `python -m experiments.efforts` measures."""
 
 
 class BudgetSpent(Exception):  # noqa: N818
@@ -36,11 +45,10 @@ class Watch:
 
     Args:
         progress: Told how far it is.
-        budget: Most loadings that may be evaluated, a gradient counted as `GRADIENT_COST`; a
-            planner ends at the first report beyond it.
+        budget: Most that may be spent; a planner ends at the first report beyond it.
 
     Attributes:
-        spent: Loadings evaluated so far.
+        spent: Evaluations so far, in loadings, see `EFFORTS`.
         best: The best plan so far; None before there is one.
         stopped: What ended the search early: "", "budget" or "interrupted".
     """
@@ -77,13 +85,13 @@ class Watch:
             return
         self.best = Best(plan, cost)
 
-    def spend(self, loadings: int, gradients: int = 0) -> None:
-        """Counts loadings that were evaluated, and those of them whose gradient was taken too.
+    def spend(self, **evaluations: float | int) -> None:
+        """Counts evaluations, by the names of `EFFORTS`.
 
         Raises:
             BudgetSpent: If that is more than the budget.
         """
-        self.spent += loadings - gradients + GRADIENT_COST * gradients
+        self.spent += sum(EFFORTS[kind] * count for kind, count in evaluations.items())
         if self._budget is not None and self.spent > self._budget:
             raise BudgetSpent
 

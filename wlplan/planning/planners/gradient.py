@@ -83,10 +83,10 @@ class Gradient:
         def evaluate(decisions: Decisions) -> tuple[Array, Decisions]:
             nonlocal step_number, cusps
             if step_number % self.search_every == 0:
-                watch.spend(self.starts * loads)
+                watch.spend(loading=self.starts * loads, way=self.starts * loads)
                 cusps = cusps_of_plans(job, decisions)
             step_number += 1
-            watch.spend(self.starts * loads, self.starts * loads)
+            watch.spend(gradient=self.starts * loads)
             found: tuple[Array, Decisions] = costs_and_gradients(
                 job, (with_trucks(decisions), cusps)
             )

@@ -38,24 +38,26 @@ class Greedy(LoadSearch):
         """One plan, leaves [1, N]; arguments as of `Planner.propose`."""
         watch = watching(progress)
         random = np.random.default_rng(seed)
-        standing, chosen, memory = beginning(job), [], Memory()
+        standing, chosen, memory, cost = beginning(job), [], Memory(), 0.0
         for load in range(loads):
             tried, memory = self.look(job, standing, random, watch, memory)
             outlook = memory.outlook
             assert outlook is not None
             decision, score = self.choose(job, standing, tried, outlook, loads - load, watch)
-            after, truck = _advance(job, standing, decision, outlook)
+            watch.spend(loading=1)
+            after, truck, of_load = _advance(job, standing, decision, outlook, score)
             if not job.amount.is_worth(float(after.done.mass - standing.done.mass)):
                 break
             standing = after
             chosen.append(decision.replace(truck=truck))
+            cost += float(of_load)
+            watch(self.stage, load + 1, loads, cost)
             watch.keep(padded(chosen, loads), -math.inf)
-            watch(self.stage, load + 1, loads, score)
-            watch.spend(1)
             if job.amount.is_done(standing.done):
                 break
         if not chosen:
             raise NothingWorthIt
+        watch.keep(padded(chosen, loads), cost + float(job.amount.rest(standing.done)))
         plan = stacked(chosen).replace(truck=None)
         if not isinstance(job.amount, Loads):
             plan = padded(chosen, loads)
@@ -70,7 +72,7 @@ class Greedy(LoadSearch):
         left: int,
         watch: Watch,
     ) -> tuple[Decisions, float]:
-        """The next load, and its score.
+        """The next load, and its score as of `score_of_next`, to which later loads may not add.
 
         Args:
             job: With its toe.

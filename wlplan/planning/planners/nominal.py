@@ -53,14 +53,17 @@ class Nominal:
         # All plans dig at the same poses, so they have the same ways, but for the soil around.
         cusps: Cusps | None = None
         if refines:
+            watch.spend(loading=loads, way=loads)
             cusps = cusps_of_plans(job, evenly_spread(job, loads, trials[:1]))
             cusps = jax.tree.map(lambda leaf: jnp.repeat(leaf, self.rows, axis=0), cusps)
 
         def evaluate(actions: Array) -> tuple[Array, Array]:
             plans = evenly_spread(job, loads, actions)
-            watch.spend(loads * len(actions), loads * len(actions) if refines else 0)
+            count = loads * len(actions)
             if not refines:
+                watch.spend(loading=count, way=count)
                 return outcomes(job, plans).cost, jnp.zeros_like(actions)
+            watch.spend(gradient=count)
             costs, gradients = costs_and_gradients(job, (plans, cusps))
             # All loadings share the action.
             return costs, gradients.action.sum(axis=1)

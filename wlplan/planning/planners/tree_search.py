@@ -29,7 +29,7 @@ class _Node(NamedTuple):
     cost: float  # of the loads, without waits for trucks, of which every plan has as many
     later: float  # cost of the trucks after the one that is there
     digs: tuple[int, ...] = ()  # rows of the raster of poses
-    first: Decisions | None = None  # of the loads
+    first: tuple[Decisions, float] | None = None  # of the loads, and its score
 
 
 class _Child(NamedTuple):
@@ -42,9 +42,9 @@ class _Child(NamedTuple):
     value: float  # cost of all loads so far and of all that is left to do
 
     @property
-    def first(self) -> Decisions:
-        """The first load of the row."""
-        return self.decision if self.parent.first is None else self.parent.first
+    def first(self) -> tuple[Decisions, float]:
+        """The first load of the row, and its score."""
+        return self.parent.first or (self.decision, self.score)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +95,7 @@ class TreeSearch(Greedy):
         left: int,
         watch: Watch,
     ) -> tuple[Decisions, float]:
-        """The first load of the cheapest row of loads, and the cost of the row and all after it."""
+        """The first load of the cheapest row of loads."""
         ended: list[_Child] = []
         nodes = [_Node(standing, 0.0, float(_cost_of_later(job, standing.done, outlook)))]
         for level in range(min(self.depth, left)):
@@ -109,8 +109,7 @@ class TreeSearch(Greedy):
             children = []
             if not nodes:
                 break
-        best = min([*ended, *children], key=lambda child: child.value)
-        return best.first, best.value
+        return min([*ended, *children], key=lambda child: child.value).first
 
     def _children(
         self, job: Job, nodes: list[_Node], tried: Tried, outlook: Outlook, watch: Watch
@@ -128,12 +127,12 @@ class TreeSearch(Greedy):
         for node in nodes:
             costs, masses = tried.costs, tried.masses
             if node.digs:
-                watch.spend(costs.size)
+                watch.spend(look=costs.size)
                 costs, masses = self._costs(job, node.standing, poses, tried.cusps, tried.actions)
             at = jax.tree.map(lambda leaf: np.asarray(leaf), (poses, tried.cusps, costs, masses))
             standing = _packed(node.standing)
             parts += [(standing, jax.tree.map(lambda leaf, r=row: leaf[r], at)) for row in rows]
-        watch.spend(steps * count * len(nodes), steps * count * len(nodes))
+        watch.spend(look_gradient=steps * count * len(nodes))
         refine = _refinement(steps, self.refine_rate, self.refine_poses)
         together = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
         found = refine((job, outlook, tried.actions), together)
@@ -173,7 +172,7 @@ class TreeSearch(Greedy):
         self, job: Job, kept: list[_Child], outlook: Outlook, watch: Watch
     ) -> tuple[list[_Node], list[bool]]:
         """The nodes that children are, and whether the job is done there."""
-        watch.spend(len(kept))
+        watch.spend(loading=len(kept))
         rows = [
             (_packed(child.parent.standing), child.decision, np.asarray(child.score))
             for child in kept
@@ -268,13 +267,9 @@ def _follow_one(
     """Where a load leaves the job, its cost, that of later trucks, and whether the job is done."""
     (job, outlook), (packed, decision, score) = shared, row
     before = _unpacked(job, packed)
-    after, _ = advance(job, before, decision, outlook)
-    amount, mass = job.amount, after.done.mass - before.done.mass
-    stays = amount.step(before.done, mass, jnp.zeros((), bool)).done
-    leaves = after.done.trucks > before.done.trucks
-    cost = score - amount.to_go(stays, outlook) + amount.step(before.done, mass, leaves).cost
-    follows = after.pile.height, after.done
-    return follows, cost, _cost_of_later(job, after.done, outlook), amount.is_done(after.done)
+    after, _, cost = advance(job, before, decision, outlook, score)
+    later, is_over = _cost_of_later(job, after.done, outlook), job.amount.is_done(after.done)
+    return (after.pile.height, after.done), cost, later, is_over
 
 
 _followed = ParallelMap(_follow_one)

@@ -1,0 +1,91 @@
+"""Planners on equal terms: whatever they are, each spends the same."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import jax
+import numpy as np
+
+from wlplan.planning.job import Decisions, Job
+from wlplan.planning.playing import outcomes
+from wlplan.planning.proposals import Planner, Progress, Proposals
+from wlplan.planning.watch import Watch
+from wlplan.types import LoadingPlan
+
+
+class OverBudget(Exception):  # noqa: N818
+    """The planner has no whole plan within the budget, which is no error."""
+
+
+@dataclasses.dataclass
+class Within:
+    """A planner that plans again, with other seeds, until a budget is spent.
+
+    Its plan is the cheapest of all in the world that it plans in. A search that the budget ends
+    counts if it had a whole plan by then.
+    """
+
+    planner: Planner
+    # In parts of what greedy takes for the same loads; None: once, whatever it takes.
+    ratio: float | None
+    # What a row of a plan takes greedy, once it is known.
+    of_greedy: float | None = None
+    # Of all parts of a job: cost in the planning world, and what was spent.
+    predicted: float = 0.0
+    spent: float = 0.0
+    rows: int = 0  # of plans, those that are not made included
+    searches: int = 0
+
+    def propose(
+        self, job: Job, loads: int, *, seed: int, progress: Progress | None = None
+    ) -> Proposals:
+        """The best plan, leaves [1, N]; arguments as of `Planner.propose`.
+
+        Raises:
+            OverBudget: If there is none.
+        """
+        del progress
+        budget = math.inf
+        if self.ratio is not None:
+            assert self.of_greedy is not None
+            budget = self.ratio * self.of_greedy * loads
+        best, least, left = None, math.inf, budget
+        for number in itertools.count():
+            watch = Watch(budget=None if math.isinf(left) else max(1, math.ceil(left)))
+            plans = None
+            with watch.ending():
+                proposals = self.planner.propose(
+                    job, loads, seed=seed + 1000 * number, progress=watch
+                )
+                plans = _stacked(proposals)
+            if watch.stopped == "interrupted":
+                raise KeyboardInterrupt
+            if plans is None and watch.best is not None and watch.best.cost > -math.inf:
+                plans = jax.tree.map(lambda leaf: leaf[None], watch.best.plan)
+            if plans is not None:
+                costs = np.asarray(outcomes(job, plans).cost, float)
+                costs = np.nan_to_num(costs, nan=np.inf, posinf=np.inf)
+                row = int(np.argmin(costs))
+                if costs[row] < least:
+                    best, least = jax.tree.map(lambda leaf, row=row: leaf[row], plans), costs[row]
+            self.spent += watch.spent
+            self.searches += 1
+            left -= watch.spent
+            if self.ratio is None or watch.stopped or left <= 0.02 * budget:
+                break
+        if best is None:
+            raise OverBudget
+        self.predicted += float(least)
+        self.rows += loads
+        return Proposals(jax.tree.map(lambda leaf: leaf[None], best))
+
+
+def _stacked(proposals: Proposals) -> Decisions | LoadingPlan:
+    """Candidates with a leading axis."""
+    candidates: Decisions | LoadingPlan = proposals.candidates
+    if np.ndim(jax.tree.leaves(candidates)[0]) == 1:
+        candidates = jax.tree.map(lambda leaf: leaf[None], candidates)
+    return candidates

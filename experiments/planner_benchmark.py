@@ -1,0 +1,454 @@
+"""What looking ahead is worth: planners on the jobs that sites have, at equal budgets.
+
+Every planner plans in the hybrid world with 1, 10 and 100 times what greedy spends there, and what
+it plans is played in the simulator, where each dig is at the toe of the pile as it is by then. Each
+run is a row of its own, in a file of its own: a run that was cut short goes on where it was, and
+several machines share the work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.stats import t as student
+
+import wlplan
+from experiments._common.budgets import OverBudget, Within
+from experiments._common.instances import JOBS, PILES, SITES, SMOKE_JOB, Instance
+from experiments._common.results import PRESETS, RESULTS, write_result
+from wlplan.io import write_bytes_atomic, write_text_atomic
+from wlplan.planning.planners import (
+    CmaEs,
+    CrossEntropy,
+    Gradient,
+    Greedy,
+    MaxLoad,
+    Nominal,
+    RandomSearch,
+    TreeSearch,
+)
+from wlplan.planning.proposals import Planner
+from wlplan.plugins import load_object
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
+
+ROWS = Path("out") / "planner_benchmark"
+# The best plan known of each instance, beside the results.
+BEST = "planner_benchmark_best.json"
+BUDGETS, SEEDS = (1, 10, 100), (0, 1, 2)
+# Planners whose runs come first.
+_FIRST = ("greedy", "gradient", "tree 2, poses refined")
+# A cycle of filling that takes longer than this has stalled [s].
+_STALL = 18.0
+_CONFIDENCE = 0.95
+
+PLANNERS: dict[str, Callable[[], Planner]] = {
+    "greedy": Greedy,
+    "nominal": Nominal,
+    "max load": MaxLoad,
+    "random search": RandomSearch,
+    "gradient": Gradient,
+    "tree 1": lambda: TreeSearch(depth=1),
+    "tree 2": lambda: TreeSearch(depth=2),
+    "tree 3": lambda: TreeSearch(depth=3),
+    "tree 4": lambda: TreeSearch(depth=4),
+    "tree 2, poses refined": lambda: TreeSearch(depth=2, refine_poses=True),
+    "cross-entropy": CrossEntropy,
+    "cma-es": CmaEs,
+}
+"""What is compared, by the name that the tables have. One more is entered by `--planner`."""
+AHEAD = tuple(name for name in PLANNERS if name not in ("greedy", "nominal", "max load"))
+"""Those that look at more than the next load."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A planner on an instance."""
+
+    instance: Instance
+    planner: str
+    budget: int  # in times what greedy spends
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """As file names have it."""
+        planner = self.planner.replace(",", "").replace(" ", "-").replace(":", "-")
+        return f"{self.instance.name}.{planner}.{self.budget}.{self.seed}"
+
+
+def runs(preset: str, planners: Sequence[str]) -> list[Run]:
+    """All runs of a preset, those that tell most first: any part of them is a fair picture."""
+    if preset == "smoke":
+        return [
+            Run(Instance("prism 0", SMOKE_JOB, SITES[0]), planner, 1, 0) for planner in planners
+        ]
+    places = itertools.product(PILES, JOBS, SITES, planners, BUDGETS, SEEDS)
+    found = [
+        Run(Instance(pile, job, site), planner, budget, seed)
+        for pile, job, site, planner, budget, seed in places
+    ]
+    return sorted(found, key=_rank)
+
+
+def _rank(run: Run) -> int:
+    """How little a run adds to what those of lower rank tell."""
+    pile = run.instance.pile
+    of_pile = 2 * int(pile.split()[1]) if pile.startswith("prism") else 0
+    of_job = {"15 loads": 0, "trucks": 0, "tonnes": 2, "empty": 2, "50 loads": 3}[run.instance.job]
+    of_site = {"fixed truck": 0, "walls, free truck": 2}.get(run.instance.site, 1)
+    of_planner = 0 if run.planner in _FIRST else 2
+    # What greedy spends is too little for most that look ahead.
+    of_budget = {1: 1, 10: 0, 100: 6}[run.budget]
+    if run.planner == "greedy":
+        of_budget -= run.budget == 1
+    return of_pile + of_job + of_site + of_planner + of_budget + 3 * run.seed
+
+
+def play_run(run: Run, planner: Planner, of_greedy: float | None) -> dict[str, Any]:
+    """Plans and plays one run.
+
+    Args:
+        run: Which one.
+        planner: Its planner.
+        of_greedy: What a row of a plan takes greedy; None: this is greedy's own.
+
+    Returns:
+        The row; `plan` is None where the budget does not suffice for one.
+    """
+    options, pile = run.instance.options(), run.instance.load_pile()
+    within = Within(planner, None if of_greedy is None else float(run.budget), of_greedy)
+    clock, processor = time.perf_counter(), time.process_time()
+    row: dict[str, Any] = {**dataclasses.asdict(run.instance), "planner": run.planner}
+    row |= {"budget": run.budget, "seed": run.seed}
+    hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
+    try:
+        result = wlplan.plan_loads(
+            hybrid, pile, planner=within, seed=run.seed, referee=simulator, **options
+        )
+    except OverBudget:
+        return {**row, "plan": None}
+    jax.block_until_ready(result.cost)
+    assert result.refereed is not None
+    assert result.receiver is not None
+    # Of the planner alone, without the search of a place for the truck.
+    row |= {"spent": within.spent, "searches": within.searches, "rows": within.rows}
+    row |= {"seconds": time.perf_counter() - clock, "processor": time.process_time() - processor}
+    row |= {"predicted": within.predicted, "simulator": _summary(result.refereed)}
+    row["plan"] = {
+        "poses": np.stack(jax.tree.leaves(result.plan.pose), axis=-1).round(4).tolist(),
+        "actions": np.stack(jax.tree.leaves(result.plan.action), axis=-1).round(5).tolist(),
+        "trucks": None if result.plan.truck is None else np.asarray(result.plan.truck).tolist(),
+        "receiver": [round(float(v), 4) for v in jax.tree.leaves(result.receiver)],
+    }
+    return row
+
+
+def _summary(played: wlplan.PlanResult) -> dict[str, float]:
+    performance, transport = jax.tree.map(
+        lambda leaf: np.asarray(leaf, float), (played.rollout.performance, played.transport)
+    )
+    return {
+        "cost": float(played.cost),
+        "loads": len(performance.mass),
+        "mass": float(performance.mass.sum()),
+        "time": float((performance.time + transport.time + transport.wait).sum()),
+        "work": float((performance.work + transport.work).sum()),
+        "stalls": int((performance.time > _STALL).sum()),
+        "touching": float(transport.touching.sum()),
+        "misfit": float(np.sum(played.misfit)),
+        "missing": float(played.missing),
+    }
+
+
+def work(
+    todo: Sequence[Run],
+    folder: Path,
+    planners: dict[str, Callable[[], Planner]],
+    until: float,
+) -> None:
+    """Makes the rows that are not there yet.
+
+    Args:
+        todo: Runs in order.
+        folder: Of the rows.
+        planners: By name.
+        until: When no further run is begun, as `time.monotonic` has it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, run in enumerate(todo):
+        if time.monotonic() > until:
+            return
+        if (folder / f"{run.name}.json").exists():
+            continue
+        of_greedy = None
+        if (run.planner, run.budget) != ("greedy", 1):
+            base = dataclasses.replace(run, planner="greedy", budget=1)
+            work([base], folder, planners, until)
+            if (row := _read(folder / f"{base.name}.json")) is None:
+                return
+            of_greedy = row["spent"] / row["rows"]
+        row = play_run(run, planners[run.planner](), of_greedy)
+        write_text_atomic(folder / f"{run.name}.json", json.dumps(row) + "\n")
+        said = {name: value for name, value in row.items() if name != "plan"}
+        print(f"{number + 1}/{len(todo)} {json.dumps(said)}", flush=True)
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    row: dict[str, Any] | None = json.loads(path.read_text()) if path.exists() else None
+    return row
+
+
+def run(preset: str, rows: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
+    """The result that rows come to.
+
+    Args:
+        preset: Of which they are a part.
+        rows: Of the runs that were made.
+    """
+    compared = [row for row in rows if row["plan"] is not None]
+    total = sum(1 for _ in runs(preset, tuple(PLANNERS)))
+    return {
+        "runs": len(rows),
+        "runs_of_the_preset": total,
+        "without_a_plan": sorted(
+            {f"{row['planner']} at {row['budget']}" for row in rows if row["plan"] is None}
+        ),
+        "looking_ahead": looking_ahead(compared),
+        "planners": by_planner(compared),
+        "rows": [{k: v for k, v in row.items() if k != "plan"} for row in compared],
+    }
+
+
+Key = tuple[str, str, str, int]
+
+
+def _key(row: dict[str, Any]) -> Key:
+    return row["pile"], row["job"], row["site"], row["seed"]
+
+
+def gains(
+    rows: Sequence[dict[str, Any]], planner: str, budget: int
+) -> list[tuple[Key, dict[str, float]]]:
+    """What a planner is better than greedy by, on the same instance and seed [%].
+
+    Args:
+        rows: All of them.
+        planner: Its name.
+        budget: Its budget; greedy has its own, 1.
+    """
+    base = {_key(row): row for row in rows if (row["planner"], row["budget"]) == ("greedy", 1)}
+    found = []
+    for row in rows:
+        if (row["planner"], row["budget"]) != (planner, budget) or _key(row) not in base:
+            continue
+        greedy = base[_key(row)]
+        found.append(
+            (
+                _key(row),
+                {
+                    "predicted": _less(row["predicted"], greedy["predicted"]),
+                    "cost": _less(row["simulator"]["cost"], greedy["simulator"]["cost"]),
+                    "seconds_a_tonne": _less(*(_a_tonne(r, "time") for r in (row, greedy))),
+                    "work_a_tonne": _less(*(_a_tonne(r, "work") for r in (row, greedy))),
+                    "loads": float(row["simulator"]["loads"] - greedy["simulator"]["loads"]),
+                },
+            )
+        )
+    return found
+
+
+def _less(value: float, than: float) -> float:
+    return 100.0 * (than - value) / than
+
+
+def _a_tonne(row: dict[str, Any], name: str) -> float:
+    return float(row["simulator"][name] / row["simulator"]["mass"])
+
+
+def interval(of: Sequence[tuple[Key, dict[str, float]]], name: str) -> dict[str, Any]:
+    """Mean over the piles, each by its mean over the seeds, and its confidence interval.
+
+    Piles are what the benchmark is to speak for; seeds of one pile are not independent of it.
+
+    Args:
+        of: Gains.
+        name: Of the measure.
+    """
+    by_pile: dict[str, list[float]] = {}
+    for (pile, *_), measures in of:
+        by_pile.setdefault(pile, []).append(measures[name])
+    means = [statistics.fmean(values) for values in by_pile.values()]
+    mean, half = statistics.fmean(means), math.nan
+    if len(means) > 1:
+        quantile = float(student.ppf(0.5 + 0.5 * _CONFIDENCE, len(means) - 1))
+        half = quantile * statistics.stdev(means) / math.sqrt(len(means))
+    return {"mean": mean, "half": None if math.isnan(half) else half, "piles": len(means)}
+
+
+def by_planner(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Every planner at every budget beside greedy, job by job and site by site."""
+    table = []
+    seen = dict.fromkeys((row["job"], row["site"], row["planner"], row["budget"]) for row in rows)
+    for job, site, planner, budget in sorted(seen):
+        here = [row for row in rows if (row["job"], row["site"]) == (job, site)]
+        found = gains(here, planner, budget)
+        if not found:
+            continue
+        own = [row for row in here if (row["planner"], row["budget"]) == (planner, budget)]
+        measures = {name: interval(found, name) for name in found[0][1]}
+        of = {
+            name: statistics.median(float(row[name]) for row in own)
+            for name in ("spent", "seconds", "processor")
+        }
+        head = {"job": job, "site": site, "planner": planner, "budget": budget}
+        table.append({**head, "pairs": len(found), **of, **measures})
+    return table
+
+
+def looking_ahead(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What the best of the planners that look ahead is better than greedy by, job by job.
+
+    The best is chosen by what it foresees, as a user would, and not by how it was played.
+    """
+    table = []
+    places = dict.fromkeys((row["job"], row["site"], row["budget"]) for row in rows)
+    for job, site, budget in sorted(places):
+        here = [row for row in rows if (row["job"], row["site"]) == (job, site)]
+        found = {planner: gains(here, planner, budget) for planner in AHEAD}
+        found = {planner: one for planner, one in found.items() if one}
+        if not found:
+            continue
+        means = {planner: interval(one, "predicted")["mean"] for planner, one in found.items()}
+        best = max(means, key=lambda planner: means[planner])
+        measures = {name: interval(found[best], name) for name in found[best][0][1]}
+        head = {"job": job, "site": site, "budget": budget, "planner": best}
+        table.append({**head, "pairs": len(found[best]), **measures})
+    return table
+
+
+def best_plans(
+    rows: Sequence[dict[str, Any]], before: Sequence[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """The plan of each instance that costs least in the simulator, of rows and those known before.
+
+    Args:
+        rows: Of runs, with their plans.
+        before: As this returns them.
+    """
+    best: dict[tuple[str, ...], dict[str, Any]] = {}
+    for row in (*before, *rows):
+        if row["plan"] is None:
+            continue
+        place = row["pile"], row["job"], row["site"]
+        if place not in best or row["simulator"]["cost"] < best[place]["simulator"]["cost"]:
+            kept = ("pile", "job", "site", "planner", "budget", "seed", "simulator", "plan")
+            best[place] = {name: row[name] for name in kept}
+    return [best[place] for place in sorted(best)]
+
+
+def draw(folder: Path) -> None:
+    """Gain of each planner against what it evaluates and against the time that takes."""
+    table = json.loads((folder / "planner_benchmark.json").read_text())["planners"]
+    jobs = [job for job in JOBS if any(row["job"] == job for row in table)]
+    figure = new_figure(2.4 * len(jobs) + 1.6, 4.8)
+    panels = figure.subplots(2, len(jobs), sharey="col", squeeze=False)
+    names = [name for name in dict.fromkeys(row["planner"] for row in table) if name != "greedy"]
+    styles = {
+        name: (BLUE if "tree" in name else ORANGE, "osD^vP*Xdp"[k % 10])
+        for k, name in enumerate(names)
+    }
+    for column, job in zip(panels.T, jobs, strict=True):
+        for panel, measure in zip(column, ("spent", "processor"), strict=True):
+            for name in names:
+                of = [row for row in table if (row["job"], row["planner"]) == (job, name)]
+                of = sorted(of, key=lambda row: (row["site"], row["budget"]))
+                colour, mark = styles[name]
+                for _, group in itertools.groupby(of, key=lambda row: row["site"]):
+                    points = list(group)
+                    panel.plot(
+                        [row[measure] for row in points],
+                        [row["cost"]["mean"] for row in points],
+                        marker=mark,
+                        ms=4,
+                        lw=0.8,
+                        color=colour,
+                    )
+            panel.axhline(0.0, color=FAINT, lw=0.8)
+            panel.set_xscale("log")
+            panel.set_yscale("symlog", linthresh=5.0)
+            tidy(panel)
+        column[0].set_title(job, fontsize=9)
+        column[0].set_xlabel("evaluations, in loadings", fontsize=8)
+        column[1].set_xlabel("processor time [s]", fontsize=8)
+    for row in panels:
+        row[0].set_ylabel("cost less than greedy's [%]", fontsize=8)
+    handles = [panels[0, 0].plot([], [], styles[n][1], color=styles[n][0], ms=4)[0] for n in names]
+    figure.legend(handles, names, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+    write_bytes_atomic(folder / "planner_benchmark.png", png_bytes(figure))
+
+
+def main() -> None:
+    """Command line: plan and play, join what was played, or draw."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.planner_benchmark")
+    parser.add_argument("--preset", choices=PRESETS, default="full")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of results")
+    parser.add_argument("--draw", action="store_true", help="only draw what is there")
+    parser.add_argument(
+        "--rows", type=Path, help=f"folder of the runs (default {ROWS}, for smoke a new one)"
+    )
+    parser.add_argument("--shard", default="1/1", help="make the I-th of N parts of the runs: I/N")
+    parser.add_argument(
+        "--minutes", type=float, default=math.inf, help="begin no run after so long"
+    )
+    parser.add_argument("--join", action="store_true", help="only join the runs that are there")
+    parser.add_argument("--only", action="append", default=[], help="only runs whose name has this")
+    parser.add_argument("--planner", action="append", default=[], metavar="MODULE:NAME")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    rows_in = options.rows or (options.out / ROWS.name if options.preset == "smoke" else ROWS)
+    if not options.draw:
+        planners = PLANNERS | {name: load_object(name) for name in options.planner}
+        chosen = tuple(SMOKE if options.preset == "smoke" else planners)
+        if not options.join:
+            until = time.monotonic() + 60.0 * options.minutes
+            part, parts = (int(number) for number in options.shard.split("/"))
+            todo = [
+                run
+                for run in runs(options.preset, chosen)
+                if all(word in run.name for word in options.only)
+            ]
+            shown = SMOKE if options.preset == "smoke" else planners
+            work(todo[part - 1 :: parts], rows_in, shown, until)
+        rows = [json.loads(path.read_text()) for path in sorted(rows_in.glob("*.json"))]
+        best = options.out / BEST
+        known = json.loads(best.read_text()) if best.exists() else []
+        lines = ",\n".join(json.dumps(one) for one in best_plans(rows, known))
+        write_text_atomic(best, f"[{lines}]\n")
+        write_result("planner_benchmark", options.preset, run(options.preset, rows), options.out)
+    draw(options.out)
+
+
+# Few trials each: whether all goes through, and not what it comes to.
+_FEW = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3)
+SMOKE: dict[str, Callable[[], Planner]] = {
+    "greedy": lambda: _FEW,
+    "tree 1": lambda: TreeSearch(depth=1, actions=6, refine_steps=2, poses_per_metre=0.3),
+    "gradient": lambda: Gradient(
+        iterations=1, starts=2, greedy=_FEW, nominal=Nominal(actions=2, rows=2, refine_steps=1)
+    ),
+}
+
+if __name__ == "__main__":
+    main()
