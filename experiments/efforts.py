@@ -18,7 +18,7 @@ from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.amounts import Loads
 from wlplan.planning.job import Job, beginning, make_job, with_toe
-from wlplan.planning.load_search import LoadSearch
+from wlplan.planning.load_search import quick_ways
 from wlplan.planning.planners import Greedy
 from wlplan.planning.playing import (
     costs_and_gradients,
@@ -38,8 +38,7 @@ def run(preset: str) -> dict[str, Any]:
     """Processor time of each kind of evaluation, in the hybrid world on a cone."""
     smoke = preset == "smoke"
     loads, plans, repeats = (2, 2, 1) if smoke else (LOADS, PLANS, REPEATS)
-    few = {"actions": 6, "refine_steps": 2, "poses_per_metre": 0.3} if smoke else {}
-    planner = Greedy(**few)
+    planner = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3) if smoke else Greedy()
     pile = wlplan.relax(wlplan.seed_pile("conical", slope=math.radians(30.0), seed=1))
     job = with_toe(make_job(wlplan.load_world("hybrid"), pile, amount=Loads(loads)))
     rows = []
@@ -52,10 +51,9 @@ def run(preset: str) -> dict[str, Any]:
     return {"world": "hybrid", "pile": "cone", "loads": loads, "plans": plans, "rows": rows}
 
 
-def _times(job: Job, planner: LoadSearch, loads: int, plans: int, repeats: int) -> dict[str, float]:
+def _times(job: Job, planner: Greedy, loads: int, plans: int, repeats: int) -> dict[str, float]:
     """Processor time of one evaluation of each kind [s]."""
-    assert isinstance(planner, Greedy)
-    one = planner.propose(job, loads, seed=0).candidates
+    one: Any = planner.propose(job, loads, seed=0).candidates
     many = jax.tree.map(lambda leaf: jnp.repeat(leaf, plans, axis=0), one)
     count = loads * plans
     cusps = cusps_of_plans(job, many)
@@ -77,25 +75,18 @@ def _times(job: Job, planner: LoadSearch, loads: int, plans: int, repeats: int) 
     tried = planner.attempt(job, standing, np.random.default_rng(0), watch)
     outlook, _ = planner.outlook(job, standing, tried, watch)
     looks = processor(lambda: planner.attempt(job, standing, np.random.default_rng(1), watch).costs)
-    ways = len(tried.poses) // (planner.neighbours * len(planner.offsets))
-    quick = processor(lambda: _quick_ways(job, planner, tried.poses)) / max(1, ways)
+    positions = tried.poses[:: planner.neighbours * len(planner.offsets), 0]
+    quick = processor(lambda: quick_ways(job, job.pile, positions, batch=8)) / len(positions)
     refined = planner.refined * planner.refine_steps
     refine = processor(lambda: planner.best(job, standing, tried, outlook, watch).scores)
     return {
         "loading": loading,
         "gradient": gradient,
-        "look": max(looks - ways * quick, 0.0) / tried.costs.size,
+        "look": max(looks - len(positions) * quick, 0.0) / tried.costs.size,
         "look_gradient": refine / refined,
         "way": searched - loading,
         "quick_way": quick,
     }
-
-
-def _quick_ways(job: Job, planner: LoadSearch, poses: np.ndarray) -> Any:
-    from wlplan.planning.load_search import _cusps_at
-
-    positions = poses[:: planner.neighbours * len(planner.offsets), 0]
-    return _cusps_at(job, job.pile, positions, batch=planner.batch // planner.actions)
 
 
 def draw(folder: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Array, Bool
 
 import wlplan
 from wlplan.io import bundled_pile_path
@@ -78,7 +78,7 @@ class Instance:
         return wlplan.relax(wlplan.seed_pile(_KINDS[kind], slope=slope, seed=seed))
 
 
-def _walls(pile: Pile) -> Bool[np.ndarray, "nx ny"]:
+def _walls(pile: Pile) -> Bool[Array, "nx ny"]:
     """Cells of three walls, a metre off the soil on all sides but that of -x."""
     soil = np.asarray(pile.height - pile.floor) > _SOIL
     rows, columns = np.flatnonzero(soil.any(axis=1)), np.flatnonzero(soil.any(axis=0))
@@ -89,4 +89,4 @@ def _walls(pile: Pile) -> Bool[np.ndarray, "nx ny"]:
     walls = np.zeros(soil.shape, bool)
     walls[rows[0] : back + thick, sides[0] - thick : sides[1] + thick] = True
     walls[rows[0] : back, sides[0] : sides[1]] = False
-    return walls
+    return jnp.asarray(walls)

@@ -125,7 +125,7 @@ class LoadSearch:
             kept = np.concatenate([np.asarray(actions)[len(known) :], known])[-self.actions :]
             actions = jnp.asarray(kept.astype(dtype))
         searched = positions[:: self.neighbours].astype(dtype)
-        cusps = _cusps_at(job, standing.pile, searched, batch=self.batch // self.actions)
+        cusps = quick_ways(job, standing.pile, searched, batch=self.batch // self.actions)
         of_pose = np.arange(len(poses)) // (self.neighbours * len(self.offsets))
         cusps = jax.tree.map(lambda leaf: leaf[of_pose], cusps)
         costs, masses = self._costs(job, standing, poses, cusps, actions)
@@ -272,8 +272,8 @@ def _portions(count: int, size: int) -> Int[np.ndarray, "portions size"]:
     return rows
 
 
-def _cusps_at(job: Job, pile: Pile, positions: Float[np.ndarray, " p"], *, batch: int) -> Cusps:
-    """Cusps of the ways from positions along the toe, square to it."""
+def quick_ways(job: Job, pile: Pile, positions: Float[np.ndarray, " p"], *, batch: int) -> Cusps:
+    """Cusps of good ways from positions along the toe, square to it, so many at once."""
     rows = _portions(len(positions), max(1, batch))
     found = _cusps_of_portions((job, pile), positions[rows])
     joined: Cusps = jax.tree.map(
