@@ -41,7 +41,7 @@ def run(preset: str) -> dict[str, Any]:
     planner = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3) if smoke else Greedy()
     pile = wlplan.relax(wlplan.seed_pile("conical", slope=math.radians(30.0), seed=1))
     job = with_toe(make_job(wlplan.load_world("hybrid"), pile, amount=Loads(loads)))
-    rows = []
+    rows: list[dict[str, Any]] = []
     for kind, seconds in _times(job, planner, loads, plans, repeats).items():
         rows.append({"kind": kind, "milliseconds": 1e3 * seconds, "counted": EFFORTS[kind]})
     one = next(row["milliseconds"] for row in rows if row["kind"] == "loading")

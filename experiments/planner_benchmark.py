@@ -33,6 +33,7 @@ from wlplan.planning.planners import (
     CrossEntropy,
     Gradient,
     Greedy,
+    IteratedGreedy,
     MaxLoad,
     Nominal,
     RandomSearch,
@@ -48,7 +49,7 @@ ROWS = Path("out") / "planner_benchmark"
 BEST = "planner_benchmark_best.json"
 BUDGETS, SEEDS = (1, 10, 100), (0, 1, 2)
 # Planners whose runs come first.
-_FIRST = ("greedy", "gradient", "tree 2, poses refined")
+_FIRST = ("greedy", "iterated greedy", "gradient from iterated")
 # A cycle of filling that takes longer than this has stalled [s].
 _STALL = 18.0
 _CONFIDENCE = 0.95
@@ -58,7 +59,9 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
     "nominal": Nominal,
     "max load": MaxLoad,
     "random search": RandomSearch,
+    "iterated greedy": IteratedGreedy,
     "gradient": Gradient,
+    "gradient from iterated": lambda: Gradient(start=IteratedGreedy()),
     "tree 1": lambda: TreeSearch(depth=1),
     "tree 2": lambda: TreeSearch(depth=2),
     "tree 3": lambda: TreeSearch(depth=3),
@@ -445,9 +448,7 @@ _FEW = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3)
 SMOKE: dict[str, Callable[[], Planner]] = {
     "greedy": lambda: _FEW,
     "tree 1": lambda: TreeSearch(depth=1, actions=6, refine_steps=2, poses_per_metre=0.3),
-    "gradient": lambda: Gradient(
-        iterations=1, starts=2, greedy=_FEW, nominal=Nominal(actions=2, rows=2, refine_steps=1)
-    ),
+    "gradient": lambda: Gradient(iterations=1, starts=2, start=_FEW),
 }
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ def run(preset: str) -> dict[str, Any]:
     if smoke:
         greedy = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3)
         nominal = Nominal(actions=6, refine_steps=2, rows=2)
-        few = Gradient(starts=2, iterations=2, candidates=3, greedy=greedy, nominal=nominal)
+        few = Gradient(starts=2, iterations=2, candidates=3, start=greedy)
         planners = (nominal, greedy, few)
     low, simulator = wlplan.load_world("low"), wlplan.load_world("simulator")
     rows = []

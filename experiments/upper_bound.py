@@ -16,7 +16,7 @@ import wlplan
 from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.job import Decisions, contour_length, make_job, with_toe
-from wlplan.planning.planners import Gradient, Greedy, Nominal
+from wlplan.planning.planners import Gradient, Greedy
 from wlplan.planning.playing import outcomes
 from wlplan.report.figures import png_bytes
 
@@ -33,8 +33,7 @@ def run(preset: str) -> dict[str, Any]:
             starts=2,
             iterations=2,
             candidates=3,
-            greedy=Greedy(actions=6, refine_steps=2, poses_per_metre=0.3),
-            nominal=Nominal(actions=6, refine_steps=2, rows=2),
+            start=Greedy(actions=6, refine_steps=2, poses_per_metre=0.3),
         )
     pile = wlplan.relax(wlplan.seed_pile(KIND, slope=math.radians(SLOPE_DEGREES), seed=SEED))
     job = with_toe(make_job(wlplan.load_world("low"), pile))

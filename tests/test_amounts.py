@@ -166,8 +166,7 @@ def test_a_planner_that_knows_nothing_of_trucks_fills_them() -> None:
 
 @pytest.mark.slow
 def test_a_descent_makes_no_truck_worse() -> None:
-    nominal = Nominal(actions=4, rows=2, refine_steps=0)
-    planner = Gradient(starts=2, iterations=4, candidates=3, greedy=GREEDY, nominal=nominal)
+    planner = Gradient(starts=2, iterations=4, candidates=3, start=GREEDY)
     job: Any = {"amount": Trucks(1, 8.0), "site": SITE}
     base = plan_loads(bowl_world, cone(), planner=GREEDY, **job)
     better = plan_loads(bowl_world, cone(), planner=planner, **job)

@@ -30,8 +30,7 @@ GRADIENT = Gradient(
     iterations=6,
     candidates=4,
     snapshot_every=3,
-    greedy=GREEDY,
-    nominal=NOMINAL,
+    start=GREEDY,
 )
 
 

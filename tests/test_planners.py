@@ -23,13 +23,15 @@ from wlplan.planning.planners import (
     CrossEntropy,
     Gradient,
     Greedy,
+    IteratedGreedy,
     MaxLoad,
     Nominal,
     RandomSearch,
     TreeSearch,
 )
 from wlplan.planning.planners.cross_entropy import _coloured
-from wlplan.planning.playing import PlanResult
+from wlplan.planning.planners.greedy import cost_of, plan_of
+from wlplan.planning.playing import PlanResult, outcomes
 from wlplan.planning.population import Near, Spread
 from wlplan.planning.proposals import Proposals
 from wlplan.planning.watch import Watch
@@ -46,8 +48,9 @@ SMALL: dict[str, Any] = {
     "cross_entropy": CrossEntropy(
         population=10, elites=4, iterations=3, start=GREEDY, candidates=2
     ),
-    "gradient": Gradient(starts=2, iterations=3, candidates=2, greedy=GREEDY, nominal=NOMINAL),
+    "gradient": Gradient(starts=2, iterations=3, candidates=2, start=GREEDY),
     "greedy": GREEDY,
+    "iterated_greedy": IteratedGreedy(rounds=2, starts=1, greedy=GREEDY, candidates=2),
     "max_load": MaxLoad(**_SEARCH),
     "nominal": NOMINAL,
     "random_search": RandomSearch(plans=16, batch=4, candidates=2),
@@ -200,6 +203,28 @@ def test_what_is_played_is_counted(plans: dict[str, PlanResult]) -> None:
 def test_what_searches_finds_the_best(planner: Any, within: float) -> None:
     """Greedy takes the fuller load first, which spoils the second."""
     assert plan(planner).cost <= LEAST * (1.0 + within)
+
+
+def test_iterated_greedy_begins_with_greedy_and_keeps_what_is_better(
+    plans: dict[str, PlanResult],
+) -> None:
+    once = plan(dataclasses.replace(SMALL["iterated_greedy"], rounds=0))
+    for a, b in zip(jax.tree.leaves(once.plan), jax.tree.leaves(plans["greedy"].plan), strict=True):
+        np.testing.assert_array_equal(a, b)
+    costs = [float(plan(IteratedGreedy(rounds=r, greedy=GREEDY)).cost) for r in (0, 3)]
+    assert costs[1] <= costs[0]
+
+
+def test_what_is_made_is_kept_and_the_rest_is_made_again() -> None:
+    asked, random = job(), np.random.default_rng(1)
+    made = GREEDY.grow(asked, [], 2, random, Watch())
+    again = GREEDY.grow(asked, made[:1], 2, random, Watch())
+    assert len(made) == len(again) == 2
+    assert again[0] is made[0]
+    assert again[1].decision.position != made[1].decision.position
+    for one in (made, again):
+        played = outcomes(asked, jax.tree.map(lambda leaf: leaf[None], plan_of(asked, one, 2)))
+        np.testing.assert_allclose(cost_of(asked, one), played.cost[0], rtol=1e-5)
 
 
 def test_a_tree_sees_what_a_load_spoils(plans: dict[str, PlanResult]) -> None:

@@ -137,17 +137,18 @@ def start_of(
     """
     if planner is None:
         return Near(job, evenly_spread(job, loads), spread_of_all(job)), None
-    plan = plan_to_start_at(planner, job, loads, seed=seed, watch=watch)
+    plans = plans_to_start_at(planner, job, loads, seed=seed, watch=watch)
+    plan: Decisions = jax.tree.map(lambda leaf: leaf[0], plans)
     return Near(job, plan, spread), plan
 
 
-def plan_to_start_at(
+def plans_to_start_at(
     planner: Planner, job: Job, loads: int, *, seed: int, watch: Watch
 ) -> Decisions:
-    """The first plan that a planner hands over, leaves [N].
+    """The plans that a planner hands over, leaves [K, N].
 
     Raises:
-        InputError: If it is of fixed poses, near which there are no other decisions.
+        InputError: If they are of fixed poses, near which there are no other decisions.
     """
     candidates = planner.propose(job, loads, seed=seed, progress=watch).candidates
     if not isinstance(candidates, Decisions):
@@ -155,10 +156,8 @@ def plan_to_start_at(
             f"{planner!r} plans fixed poses: start at the plan of one that decides along the toe, "
             f"such as wlplan.planners.Greedy()."
         )
-    if candidates.position.ndim == 1:
-        return candidates
-    first: Decisions = jax.tree.map(lambda leaf: leaf[0], candidates)
-    return first
+    one: Decisions = jax.tree.map(lambda leaf: leaf[None], candidates)
+    return one if candidates.position.ndim == 1 else candidates
 
 
 def evenly_spread(job: Job, loads: int) -> Decisions:

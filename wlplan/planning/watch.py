@@ -75,13 +75,14 @@ class Watch:
             self.stopped = "interrupted"
 
     def keep(self, plan: Decisions | LoadingPlan, cost: float) -> None:
-        """Remembers a plan if it is better than those before.
+        """Remembers a plan if it is better than those before; one that grows only before others.
 
         Args:
             plan: Leaves [N]; of a plan that grows load by load, what there is of it.
             cost: Of the plan in the planning world; of one that grows, minus infinity.
         """
-        if np.isnan(cost) or (self.best is not None and cost >= self.best.cost > -np.inf):
+        before = -np.inf if self.best is None else self.best.cost
+        if np.isnan(cost) or (before > -np.inf and not -np.inf < cost < before):
             return
         self.best = Best(plan, cost)
 

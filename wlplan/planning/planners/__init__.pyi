@@ -4,6 +4,7 @@ from .cma_es import CmaEs as CmaEs
 from .cross_entropy import CrossEntropy as CrossEntropy
 from .gradient import Gradient as Gradient
 from .greedy import Greedy as Greedy
+from .iterated_greedy import IteratedGreedy as IteratedGreedy
 from .max_load import MaxLoad as MaxLoad
 from .nominal import Nominal as Nominal
 from .random_search import RandomSearch as RandomSearch

@@ -15,19 +15,20 @@ from jaxtyping import Array, Float
 from wlplan.planning.descent import Descent, begin, descend_stepwise, least, step
 from wlplan.planning.job import Decisions, Job, check_has_gradient, contour_length
 from wlplan.planning.planners.greedy import Greedy
-from wlplan.planning.planners.nominal import Nominal
 from wlplan.planning.playing import costs_and_gradients, cusps_of_plans
-from wlplan.planning.proposals import Progress, Proposals
+from wlplan.planning.population import plans_to_start_at
+from wlplan.planning.proposals import Planner, Progress, Proposals
 from wlplan.planning.watch import watching
 
-_GREEDY, _NOMINAL = Greedy(), Nominal(refine_steps=6)
+_GREEDY = Greedy()
 
 
 @dataclasses.dataclass(frozen=True)
 class Gradient:
-    """Improves all loadings at once from the greedy plan, the nominal one, and perturbed ones."""
+    """Improves all loadings at once: plans of another planner, and perturbations of the first."""
 
-    # Plans that are optimised side by side: greedy, nominal, and perturbations of the first.
+    # Plans that are optimised side by side: those of the planner that it starts at, as many as it
+    # hands over, and perturbations of the first.
     starts: int = 6
     iterations: int = 32
     # Largest step of an iteration: along the contour [m], heading offset and action before
@@ -39,46 +40,46 @@ class Gradient:
     spread_position: float = 1.5
     spread_offset: float = 0.3
     spread_action: float = 0.5
-    # How many plans are handed on, the greedy one included, and how often one is taken from each
+    # How many plans are handed on, the first start included, and how often one is taken from each
     # start as the iterations go.
     candidates: int = 16
     snapshot_every: int = 4
     # How often the ways are searched for; in between they move with the poses.
     search_every: int = 8
-    # Where the first two starts come from.
-    greedy: Greedy = _GREEDY
-    nominal: Nominal = _NOMINAL
+    # Whose plans it starts at.
+    start: Planner = _GREEDY
 
     def propose(
         self, job: Job, loads: int, *, seed: int, progress: Progress | None = None
     ) -> Proposals:
         """The cheapest plans that were passed, in the order of their cost, leaves [K, N].
 
-        The limit is the greedy plan: nothing that costs more is handed on. Arguments as of
-        `Planner.propose`.
+        The limit is the first plan that it starts at: nothing that costs more is handed on.
+        Arguments as of `Planner.propose`.
 
         Raises:
-            InputError: If the world has no derivative.
+            InputError: If the world has no derivative, or the planner that it starts at plans fixed
+                poses.
         """
         check_has_gradient(job, "plan in a learned world, or use the greedy or the nominal planner")
         watch = watching(progress)
-        base: Any = self.greedy.propose(job, loads, seed=seed, progress=watch).candidates
-        even: Any = self.nominal.propose(job, loads, seed=seed, progress=watch).candidates
-        # All have the trucks of the greedy plan: which load is a truck's last has no gradient.
-        trucks, base = base.truck, base.replace(truck=None)
+        plans = plans_to_start_at(self.start, job, loads, seed=seed, watch=watch)
         length = contour_length(job)
         random = np.random.default_rng([seed, 1])
-        shaken = (self._perturbed(base, length, random) for _ in range(self.starts))
-        rows = [base, even, *shaken]
-        start = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: self.starts], *rows)
+        shaken = (self._perturbed(_row(plans, 0), length, random) for _ in range(self.starts))
+        start = jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[: self.starts], plans, *shaken)
+        # Which load is a truck's last has no gradient.
+        trucks, start = start.truck, start.replace(truck=None)
+        base = _row(plans, 0)
+
+        def with_truck(variables: Decisions, row: int) -> Decisions:
+            one = _row(variables, row)
+            return one.replace(truck=None if trucks is None else trucks[row : row + 1])
+
         # Every plan that may be handed on: cost, and decisions with a leading axis of one.
         snapshots: list[tuple[float, Decisions]] = []
         limit = np.inf
         step_number, cusps = 0, None
-
-        def with_trucks(plans: Decisions) -> Decisions:
-            count = len(plans.position)
-            return plans.replace(truck=None if trucks is None else jnp.repeat(trucks, count, 0))
 
         def evaluate(decisions: Decisions) -> tuple[Array, Decisions]:
             nonlocal step_number, cusps
@@ -88,7 +89,7 @@ class Gradient:
             step_number += 1
             watch.spend(gradient=self.starts * loads)
             found: tuple[Array, Decisions] = costs_and_gradients(
-                job, (with_trucks(decisions), cusps)
+                job, (decisions.replace(truck=trucks), cusps)
             )
             return found
 
@@ -99,10 +100,12 @@ class Gradient:
                 limit = float(values[0])
             if number % self.snapshot_every == 0:
                 found = np.flatnonzero(np.isfinite(values))
-                snapshots.extend((float(values[r]), _row(descent.variables, int(r))) for r in found)
+                snapshots.extend(
+                    (float(values[row]), with_truck(descent.variables, int(row))) for row in found
+                )
             if np.isfinite(values).any():
                 row = int(np.nanargmin(values))
-                plan = with_trucks(_row(descent.variables, row))
+                plan = with_truck(descent.variables, row)
                 watch.keep(jax.tree.map(lambda leaf: leaf[0], plan), float(values[row]))
             reached = min(least(descent.best_costs), least(values))
             watch("gradient", number, self.iterations, reached)
@@ -115,7 +118,7 @@ class Gradient:
             visit,
         )
         best = [
-            (float(cost), _row(last.best, row))
+            (float(cost), with_truck(last.best, row))
             for row, cost in enumerate(np.asarray(last.best_costs))
             if np.isfinite(cost)
         ]
@@ -127,8 +130,7 @@ class Gradient:
         candidates = jax.tree.map(
             lambda *leaves: jnp.concatenate(leaves), *[cheap[k] for k in picks]
         )
-        limit_plan = jax.tree.map(lambda leaf: leaf[0], with_trucks(base))
-        return Proposals(with_trucks(candidates), limit=limit_plan)
+        return Proposals(candidates, limit=jax.tree.map(lambda leaf: leaf[0], base))
 
     def _optimiser(self, length: Float[Array, ""]) -> optax.GradientTransformation:
         """Adam with a step length for each kind of variable."""
@@ -156,6 +158,7 @@ class Gradient:
             position=shaken(plan.position, self.spread_position / length),
             offset=shaken(plan.offset, self.spread_offset),
             action=shaken(plan.action, self.spread_action),
+            truck=plan.truck,
         )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import ClassVar
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
 
 import jax
 import numpy as np
@@ -15,6 +16,15 @@ from wlplan.planning.load_search import LoadSearch, Memory, Tried
 from wlplan.planning.proposals import NothingWorthIt, Progress, Proposals
 from wlplan.planning.stepping import advance
 from wlplan.planning.watch import Watch, watching
+
+
+class Grown(NamedTuple):
+    """A load of a plan that grows."""
+
+    decision: Decisions  # with its truck
+    standing: Standing  # after it
+    memory: Memory  # for the next
+    cost: float  # of it, without the wait for a truck
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,31 +47,55 @@ class Greedy(LoadSearch):
     ) -> Proposals:
         """One plan, leaves [1, N]; arguments as of `Planner.propose`."""
         watch = watching(progress)
-        random = np.random.default_rng(seed)
-        standing, chosen, memory, cost = beginning(job), [], Memory(), 0.0
-        for load in range(loads):
+        made = self.grow(job, [], loads, np.random.default_rng(seed), watch, says=True)
+        watch.keep(plan_of(job, made, loads), cost_of(job, made))
+        return Proposals(jax.tree.map(lambda leaf: leaf[None], plan_of(job, made, loads)))
+
+    def grow(
+        self,
+        job: Job,
+        made: list[Grown],
+        loads: int,
+        random: np.random.Generator,
+        watch: Watch,
+        *,
+        says: bool = False,
+    ) -> list[Grown]:
+        """Loads until the job is done, or no load is worth it.
+
+        Args:
+            job: With its toe.
+            made: Loads that are made already.
+            loads: Rows of the plan: the most loads, those included.
+            random: Source of what is tried.
+            watch: Told what it took.
+            says: Whether the watch is told of each load.
+
+        Raises:
+            NothingWorthIt: If there is none at all.
+        """
+        made = list(made)
+        standing, memory = (
+            (made[-1].standing, made[-1].memory) if made else (beginning(job), Memory())
+        )
+        while len(made) < loads and not bool(job.amount.is_done(standing.done)):
             tried, memory = self.look(job, standing, random, watch, memory)
             outlook = memory.outlook
             assert outlook is not None
-            decision, score = self.choose(job, standing, tried, outlook, loads - load, watch)
+            left = loads - len(made)
+            decision, score = self.choose(job, standing, tried, outlook, left, watch)
             watch.spend(loading=1)
-            after, truck, of_load = _advance(job, standing, decision, outlook, score)
+            after, truck, cost = _advance(job, standing, decision, outlook, score)
             if not job.amount.is_worth(float(after.done.mass - standing.done.mass)):
                 break
             standing = after
-            chosen.append(decision.replace(truck=truck))
-            cost += float(of_load)
-            watch(self.stage, load + 1, loads, cost)
-            watch.keep(padded(chosen, loads), -math.inf)
-            if job.amount.is_done(standing.done):
-                break
-        if not chosen:
+            made.append(Grown(decision.replace(truck=truck), standing, memory, float(cost)))
+            if says:
+                watch(self.stage, len(made), loads, cost_of(job, made))
+                watch.keep(plan_of(job, made, loads), -math.inf)
+        if not made:
             raise NothingWorthIt
-        watch.keep(padded(chosen, loads), cost + float(job.amount.rest(standing.done)))
-        plan = stacked(chosen).replace(truck=None)
-        if not isinstance(job.amount, Loads):
-            plan = padded(chosen, loads)
-        return Proposals(jax.tree.map(lambda leaf: leaf[None], plan))
+        return made
 
     def choose(
         self,
@@ -87,6 +121,20 @@ class Greedy(LoadSearch):
         best = int(np.argmin(found.scores))
         decision: Decisions = jax.tree.map(lambda leaf: leaf[best], found.decisions)
         return decision, float(found.scores[best])
+
+
+def plan_of(job: Job, made: Sequence[Grown], loads: int) -> Decisions:
+    """Loads in order as a plan, leaves [N]; rows that are not made have no truck."""
+    chosen = [one.decision for one in made]
+    is_whole = len(chosen) == loads or bool(job.amount.is_done(made[-1].standing.done))
+    if isinstance(job.amount, Loads) and is_whole:
+        return stacked(chosen).replace(truck=None)
+    return padded(chosen, loads)
+
+
+def cost_of(job: Job, made: Sequence[Grown]) -> float:
+    """What loads cost, and what they leave undone; without the waits for trucks."""
+    return sum(one.cost for one in made) + float(job.amount.rest(made[-1].standing.done))
 
 
 _advance = jax.jit(advance)
