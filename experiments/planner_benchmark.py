@@ -48,8 +48,19 @@ ROWS = Path("out") / "planner_benchmark"
 # The best plan known of each instance, beside the results.
 BEST = "planner_benchmark_best.json"
 BUDGETS, SEEDS = (1, 10, 100), (0, 1, 2)
-# Planners whose runs come first.
-_FIRST = ("greedy", "iterated greedy", "gradient from iterated")
+# What is run first, see `_rank`: planners, jobs and sites.
+_PLANNERS = {"greedy": 0, "iterated greedy": 0, "gradient from iterated": 1}
+_PLACES = {
+    ("15 loads", "fixed truck"): 0,
+    ("15 loads", "free truck"): 0,
+    ("15 loads", "walls"): 1,
+    ("trucks", "fixed truck"): 0,
+    ("trucks", "free truck"): 0,
+    ("trucks", "walls, free truck"): 1,
+    ("tonnes", "fixed truck"): 1,
+    ("empty", "fixed truck"): 1,
+    ("50 loads", "fixed truck"): 2,
+}
 # A cycle of filling that takes longer than this has stalled [s].
 _STALL = 18.0
 _CONFIDENCE = 0.95
@@ -107,16 +118,14 @@ def runs(preset: str, planners: Sequence[str]) -> list[Run]:
 
 def _rank(run: Run) -> int:
     """How little a run adds to what those of lower rank tell."""
-    pile = run.instance.pile
-    of_pile = 2 * int(pile.split()[1]) if pile.startswith("prism") else 0
-    of_job = {"15 loads": 0, "trucks": 0, "tonnes": 2, "empty": 2, "50 loads": 3}[run.instance.job]
-    of_site = {"fixed truck": 0, "walls, free truck": 2}.get(run.instance.site, 1)
-    of_planner = 0 if run.planner in _FIRST else 2
+    pile, place = run.instance.pile, (run.instance.job, run.instance.site)
+    of_pile = 2 * int(pile.split()[1]) if pile.startswith("prism") else int(pile == "wedge")
+    of_place = _PLACES.get(place, 6)
+    of_planner = _PLANNERS.get(run.planner, 2)
     # What greedy spends is too little for most that look ahead.
-    of_budget = {1: 1, 10: 0, 100: 6}[run.budget]
-    if run.planner == "greedy":
-        of_budget -= run.budget == 1
-    return of_pile + of_job + of_site + of_planner + of_budget + 3 * run.seed
+    first = 1 if run.planner == "greedy" else 10
+    of_budget = 0 if run.budget == first else {1: 2, 10: 2, 100: 6}[run.budget]
+    return of_pile + of_place + of_planner + of_budget + 3 * run.seed
 
 
 def play_run(run: Run, planner: Planner, of_greedy: float | None) -> dict[str, Any]:
