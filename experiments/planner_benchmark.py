@@ -64,13 +64,15 @@ _PLACES = {
 # A cycle of filling that takes longer than this has stalled [s].
 _STALL = 18.0
 _CONFIDENCE = 0.95
+# So little compiling does not show in the time of a run [s].
+_WARM = 0.5
 
 PLANNERS: dict[str, Callable[[], Planner]] = {
     "greedy": Greedy,
     "nominal": Nominal,
     "max load": MaxLoad,
     "random search": RandomSearch,
-    "iterated greedy": IteratedGreedy,
+    "iterated greedy": lambda: IteratedGreedy(rounds=10_000),
     "gradient": Gradient,
     "gradient from iterated": lambda: Gradient(start=IteratedGreedy()),
     "tree 1": lambda: TreeSearch(depth=1),
@@ -142,6 +144,7 @@ def play_run(run: Run, planner: Planner, of_greedy: float | None) -> dict[str, A
     options, pile = run.instance.options(), run.instance.load_pile()
     within = Within(planner, None if of_greedy is None else float(run.budget), of_greedy)
     clock, processor = time.perf_counter(), time.process_time()
+    _compiled.seconds = 0.0
     row: dict[str, Any] = {**dataclasses.asdict(run.instance), "planner": run.planner}
     row |= {"budget": run.budget, "seed": run.seed}
     hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
@@ -157,6 +160,7 @@ def play_run(run: Run, planner: Planner, of_greedy: float | None) -> dict[str, A
     # Of the planner alone, without the search of a place for the truck.
     row |= {"spent": within.spent, "searches": within.searches, "rows": within.rows}
     row |= {"seconds": time.perf_counter() - clock, "processor": time.process_time() - processor}
+    row["compiled"] = _compiled.seconds > _WARM
     row |= {"predicted": within.predicted, "simulator": _summary(result.refereed)}
     row["plan"] = {
         "poses": np.stack(jax.tree.leaves(result.plan.pose), axis=-1).round(4).tolist(),
@@ -165,6 +169,21 @@ def play_run(run: Run, planner: Planner, of_greedy: float | None) -> dict[str, A
         "receiver": [round(float(v), 4) for v in jax.tree.leaves(result.receiver)],
     }
     return row
+
+
+class _Compiled:
+    """How long XLA compiled [s]."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._add)
+
+    def _add(self, event: str, duration_secs: float, **_: Any) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            self.seconds += duration_secs
+
+
+_compiled = _Compiled()
 
 
 def _summary(played: wlplan.PlanResult) -> dict[str, float]:
@@ -320,10 +339,13 @@ def by_planner(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             continue
         own = [row for row in here if (row["planner"], row["budget"]) == (planner, budget)]
         measures = {name: interval(found, name) for name in found[0][1]}
-        of = {
-            name: statistics.median(float(row[name]) for row in own)
-            for name in ("spent", "seconds", "processor")
+        of: dict[str, float | None] = {
+            "spent": statistics.median(float(row["spent"]) for row in own)
         }
+        # Times tell something where nothing was compiled.
+        warm = [row for row in own if not row["compiled"]]
+        for name in ("seconds", "processor"):
+            of[name] = statistics.median(float(r[name]) for r in warm) if warm else None
         head = {"job": job, "site": site, "planner": planner, "budget": budget}
         table.append({**head, "pairs": len(found), **of, **measures})
     return table
@@ -388,7 +410,7 @@ def draw(folder: Path) -> None:
                 of = sorted(of, key=lambda row: (row["site"], row["budget"]))
                 colour, mark = styles[name]
                 for _, group in itertools.groupby(of, key=lambda row: row["site"]):
-                    points = list(group)
+                    points = [row for row in group if row[measure] is not None]
                     panel.plot(
                         [row[measure] for row in points],
                         [row["cost"]["mean"] for row in points],

@@ -27,10 +27,12 @@ class IteratedGreedy:
     """
 
     # How often loads are made again.
-    rounds: int = 12
+    rounds: int = 10
     # Greedy, and how many of its plans are made from nothing before that.
     greedy: Greedy = _GREEDY
-    starts: int = 2
+    starts: int = 3
+    # Of how many plans, the best so far, one is drawn whose loads are made again.
+    parents: int = 3
     # How many plans are handed on.
     candidates: int = 4
 
@@ -49,17 +51,17 @@ class IteratedGreedy:
         watch = watching(progress)
         random = np.random.default_rng(seed)
         pool = Pool(job, watch, self.candidates)
-        best: tuple[float, list[Grown]] | None = None
+        best: list[tuple[float, list[Grown]]] = []
         total = self.starts + self.rounds
         for number in range(total):
             kept: list[Grown] = []
-            if best is not None and number >= self.starts:
-                kept = best[1][: random.integers(len(best[1]))]
-            made = self.greedy.grow(job, kept, loads, random, watch, says=best is None)
+            if number >= self.starts:
+                parent = best[random.integers(len(best))][1]
+                kept = parent[: random.integers(len(parent))]
+            made = self.greedy.grow(job, kept, loads, random, watch, says=not best)
             # What greedy makes of the ways is too rough to choose by.
             plan = jax.tree.map(lambda leaf: leaf[None], plan_of(job, made, loads))
             cost = float(pool.play(plan)[0])
-            if best is None or cost < best[0]:
-                best = cost, made
+            best = sorted([*best, (cost, made)], key=lambda pair: pair[0])[: self.parents]
             watch("iterated greedy", number + 1, total, pool.least)
         return Proposals(pool.cheapest())
