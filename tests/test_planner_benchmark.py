@@ -1,0 +1,141 @@
+"""What the benchmark of planners rests on: budgets, pairs, intervals, walls."""
+
+import dataclasses
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from cones import SITE, circle, cone, spoilt_world
+
+from experiments import planner_benchmark as benchmark
+from experiments._common.budgets import OverBudget, Within
+from experiments._common.instances import Instance
+from wlplan.planning.amounts import Loads
+from wlplan.planning.job import Job, make_job, with_toe
+from wlplan.planning.planners import Greedy, RandomSearch
+from wlplan.planning.playing import outcomes
+from wlplan.planning.watch import Watch
+
+GREEDY = Greedy(poses_per_metre=0.5, actions=12, refined=4, refine_steps=20)
+RANDOM = RandomSearch(plans=8, batch=4, candidates=2)
+
+
+def job() -> Job:
+    asked = make_job(spoilt_world, cone(), site=SITE, amount=Loads(2))
+    return with_toe(asked, circle())
+
+
+def row(
+    pile: str, planner: str, budget: int, seed: int, cost: float, **more: Any
+) -> dict[str, Any]:
+    played = {"cost": cost, "loads": 15, "mass": 60.0, "time": 600.0, "work": 1e4}
+    place = {"pile": pile, "job": "15 loads", "site": "walls"}
+    of = {"planner": planner, "budget": budget, "seed": seed, "predicted": cost}
+    return {**place, **of, "simulator": played, "plan": {"poses": []}, **more}
+
+
+def test_a_budget_is_spent_and_kept() -> None:
+    asked, watch = job(), Watch()
+    RANDOM.propose(asked, 2, seed=0, progress=watch)
+    once = watch.spent
+    within = Within(RANDOM, 5.0, once / 2)
+    plans = within.propose(asked, 2, seed=0)
+    assert within.searches >= 5
+    assert 0.98 * 5.0 * once <= within.spent <= 5.0 * once + once
+    assert within.predicted == pytest.approx(float(outcomes(asked, plans.candidates).cost[0]))
+    few = Within(RANDOM, 1.0, once / 2)
+    few.propose(asked, 2, seed=0)
+    assert within.predicted <= few.predicted
+
+
+def test_half_a_plan_is_none() -> None:
+    asked, watch = job(), Watch()
+    GREEDY.propose(asked, 2, seed=0, progress=watch)
+    with pytest.raises(OverBudget):
+        Within(GREEDY, 0.5, watch.spent / 2).propose(asked, 2, seed=0)
+
+
+def test_pairs_are_of_one_instance_and_seed() -> None:
+    rows = [
+        row("cone", "greedy", 1, 0, 50.0),
+        row("cone", "greedy", 1, 1, 40.0),
+        row("cone", "cma-es", 10, 0, 49.0),
+        row("cone", "cma-es", 10, 1, 41.0),
+        row("cone", "cma-es", 10, 2, 1.0),
+        row("cone", "cma-es", 1, 0, 1.0),
+    ]
+    found = benchmark.gains(rows, "cma-es", 10)
+    assert [key[-1] for key, _ in found] == [0, 1]
+    np.testing.assert_allclose([one["cost"] for _, one in found], [2.0, -2.5])
+    np.testing.assert_allclose([one["seconds_a_tonne"] for _, one in found], 0.0)
+
+
+def test_an_interval_is_over_piles() -> None:
+    """Student's interval of the means 1, 2 and 6, whatever the number of seeds."""
+    of = [
+        (("a", "", "", 0), {"cost": 0.0}),
+        (("a", "", "", 1), {"cost": 2.0}),
+        (("b", "", "", 0), {"cost": 2.0}),
+        (("c", "", "", 0), {"cost": 6.0}),
+    ]
+    found = benchmark.interval(of, "cost")
+    assert found["piles"] == 3
+    assert found["mean"] == pytest.approx(3.0)
+    # 4.3027 is the quantile of two degrees of freedom, the deviation of the means is sqrt(7).
+    assert found["half"] == pytest.approx(4.3027 * math.sqrt(7.0 / 3.0), rel=1e-4)
+    assert benchmark.interval(of[:2], "cost")["half"] is None
+
+
+def test_the_best_plan_known_is_kept() -> None:
+    before = [row("cone", "greedy", 1, 0, 50.0), row("ridge", "greedy", 1, 0, 30.0)]
+    known = benchmark.best_plans(before, [])
+    again = benchmark.best_plans(
+        [row("cone", "cma-es", 10, 0, 49.0), row("ridge", "cma-es", 10, 0, 31.0)], known
+    )
+    assert [(one["pile"], one["simulator"]["cost"]) for one in again] == [
+        ("cone", 49.0),
+        ("ridge", 30.0),
+    ]
+    assert benchmark.best_plans([row("cone", "x", 1, 0, 1.0, plan=None)], known) == known
+
+
+def test_shards_share_the_runs_out() -> None:
+    runs = benchmark.runs("full", tuple(benchmark.PLANNERS))
+    names = [run.name for run in runs]
+    assert len(set(names)) == len(names)
+    parts = [runs[k::3] for k in range(3)]
+    assert sorted(run.name for part in parts for run in part) == sorted(names)
+    assert runs[0].planner == "greedy"
+
+
+def test_what_was_run_is_not_run_again(tmp_path: Path) -> None:
+    (run,) = [one for one in benchmark.runs("smoke", ("greedy",))]
+    place = tmp_path / f"{run.name}.json"
+    place.write_text(json.dumps({"kept": True}))
+    benchmark.work([run], tmp_path, {}, time.monotonic() + 60.0)
+    assert json.loads(place.read_text()) == {"kept": True}
+
+
+@pytest.mark.parametrize("name", ["prism 0", "cone", "bundled"])
+def test_walls_stand_around_the_soil_and_leave_the_west_open(name: str) -> None:
+    instance = Instance(name, "15 loads", "walls")
+    options, pile = instance.options(), instance.load_pile()
+    walls = np.asarray(options["site"].keep_out)
+    soil = np.asarray(pile.height - pile.floor) > 0.25
+    assert walls.any()
+    rows, columns = np.nonzero(soil)
+    # East of the soil, and north and south of it, a wall is met; west of it none.
+    for i, j in zip(rows[::997], columns[::997], strict=True):
+        assert walls[i:, j].any()
+        assert walls[i, :j].any()
+        assert walls[i, j:].any()
+        assert not walls[:i, j].any()
+    free = dataclasses.replace(instance, site="walls, free truck").options()
+    assert free["truck"] == "auto"
+    assert options["truck"] is None
+    assert jax.tree.leaves(free["site"].receiver) == jax.tree.leaves(options["site"].receiver)
