@@ -142,12 +142,13 @@ def play_run(run: Run, planner: Planner, of_greedy: float | None) -> dict[str, A
         The row; `plan` is None where the budget does not suffice for one.
     """
     options, pile = run.instance.options(), run.instance.load_pile()
-    within = Within(planner, None if of_greedy is None else float(run.budget), of_greedy)
     clock, processor = time.perf_counter(), time.process_time()
     _compiled.seconds = 0.0
     row: dict[str, Any] = {**dataclasses.asdict(run.instance), "planner": run.planner}
     row |= {"budget": run.budget, "seed": run.seed}
     hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
+    ratio = None if of_greedy is None else float(run.budget)
+    within = Within(planner, ratio, of_greedy, referee=simulator)
     try:
         result = wlplan.plan_loads(
             hybrid, pile, planner=within, seed=run.seed, referee=simulator, **options
@@ -162,6 +163,8 @@ def play_run(run: Run, planner: Planner, of_greedy: float | None) -> dict[str, A
     row |= {"seconds": time.perf_counter() - clock, "processor": time.process_time() - processor}
     row["compiled"] = _compiled.seconds > _WARM
     row |= {"predicted": within.predicted, "simulator": _summary(result.refereed)}
+    # What the simulator would have picked of the best few plans; of a job of one part.
+    row["picked"] = _summary(within.picked[0]) if len(within.picked) == 1 else None
     row["plan"] = {
         "poses": np.stack(jax.tree.leaves(result.plan.pose), axis=-1).round(4).tolist(),
         "actions": np.stack(jax.tree.leaves(result.plan.action), axis=-1).round(5).tolist(),
@@ -291,6 +294,7 @@ def gains(
                 {
                     "predicted": _less(row["predicted"], greedy["predicted"]),
                     "cost": _less(row["simulator"]["cost"], greedy["simulator"]["cost"]),
+                    "picked": _less(_picked(row), _picked(greedy)),
                     "seconds_a_tonne": _less(*(_a_tonne(r, "time") for r in (row, greedy))),
                     "work_a_tonne": _less(*(_a_tonne(r, "work") for r in (row, greedy))),
                     "loads": float(row["simulator"]["loads"] - greedy["simulator"]["loads"]),
@@ -302,6 +306,10 @@ def gains(
 
 def _less(value: float, than: float) -> float:
     return 100.0 * (than - value) / than
+
+
+def _picked(row: dict[str, Any]) -> float:
+    return float((row["picked"] or row["simulator"])["cost"])
 
 
 def _a_tonne(row: dict[str, Any], name: str) -> float:

@@ -36,7 +36,7 @@ def row(
     played = {"cost": cost, "loads": 15, "mass": 60.0, "time": 600.0, "work": 1e4}
     place = {"pile": pile, "job": "15 loads", "site": "walls"}
     of = {"planner": planner, "budget": budget, "seed": seed, "predicted": cost}
-    return {**place, **of, "simulator": played, "plan": {"poses": []}, **more}
+    return {**place, **of, "simulator": played, "picked": None, "plan": {"poses": []}, **more}
 
 
 def test_a_budget_is_spent_and_kept() -> None:

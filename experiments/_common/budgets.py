@@ -7,13 +7,18 @@ import itertools
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from wlplan.planning.job import Decisions, Job
-from wlplan.planning.playing import outcomes
-from wlplan.planning.proposals import Planner, Progress, Proposals
+from wlplan.planning.plan import choose
+from wlplan.planning.playing import PlanResult, outcomes
+from wlplan.planning.proposals import NothingWorthIt, Planner, Progress, Proposals
 from wlplan.planning.watch import Watch
-from wlplan.types import LoadingPlan
+from wlplan.types import LoadingPlan, World
+
+# Plans that a referee is shown.
+_SHOWN = 16
 
 
 class OverBudget(Exception):  # noqa: N818
@@ -33,11 +38,15 @@ class Within:
     ratio: float | None
     # What a row of a plan takes greedy, once it is known.
     of_greedy: float | None = None
+    # Who is shown the best few plans, and picks; None: nobody.
+    referee: World | None = None
     # Of all parts of a job: cost in the planning world, and what was spent.
     predicted: float = 0.0
     spent: float = 0.0
     rows: int = 0  # of plans, those that are not made included
     searches: int = 0
+    # Of each part: what the referee picked, as it played it.
+    picked: list[PlanResult] = dataclasses.field(default_factory=list)
 
     def propose(
         self, job: Job, loads: int, *, seed: int, progress: Progress | None = None
@@ -52,35 +61,48 @@ class Within:
         if self.ratio is not None:
             assert self.of_greedy is not None
             budget = self.ratio * self.of_greedy * loads
-        best, least, left = None, math.inf, budget
+        found: list[tuple[float, Decisions | LoadingPlan]] = []
+        left = budget
         for number in itertools.count():
             watch = Watch(budget=None if math.isinf(left) else max(1, math.ceil(left)))
             plans = None
-            with watch.ending():
-                proposals = self.planner.propose(
-                    job, loads, seed=seed + 1000 * number, progress=watch
-                )
-                plans = _stacked(proposals)
+            try:
+                with watch.ending():
+                    proposals = self.planner.propose(
+                        job, loads, seed=seed + 1000 * number, progress=watch
+                    )
+                    plans = _stacked(proposals)
+            except NothingWorthIt:
+                if not found:
+                    raise
+                break
             if watch.stopped == "interrupted":
                 raise KeyboardInterrupt
             if plans is None and watch.best is not None and watch.best.cost > -math.inf:
                 plans = jax.tree.map(lambda leaf: leaf[None], watch.best.plan)
             if plans is not None:
                 costs = np.asarray(outcomes(job, plans).cost, float)
-                costs = np.nan_to_num(costs, nan=np.inf, posinf=np.inf)
-                row = int(np.argmin(costs))
-                if costs[row] < least:
-                    best, least = jax.tree.map(lambda leaf, row=row: leaf[row], plans), costs[row]
+                found += [
+                    (float(cost), jax.tree.map(lambda leaf, row=row: leaf[row], plans))
+                    for row, cost in enumerate(costs)
+                    if np.isfinite(cost)
+                ]
             self.spent += watch.spent
             self.searches += 1
             left -= watch.spent
             if self.ratio is None or watch.stopped or left <= 0.02 * budget:
                 break
-        if best is None:
+        if not found:
             raise OverBudget
-        self.predicted += float(least)
+        found = sorted(found, key=lambda pair: pair[0])[:_SHOWN]
+        self.predicted += found[0][0]
         self.rows += loads
-        return Proposals(jax.tree.map(lambda leaf: leaf[None], best))
+        plans = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(plan for _, plan in found))
+        if self.referee is not None:
+            picked = choose(job, Proposals(plans), referee=self.referee).refereed
+            assert picked is not None
+            self.picked.append(picked)
+        return Proposals(jax.tree.map(lambda leaf: leaf[:1], plans))
 
 
 def _stacked(proposals: Proposals) -> Decisions | LoadingPlan:

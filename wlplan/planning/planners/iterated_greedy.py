@@ -34,7 +34,7 @@ class IteratedGreedy:
     # Of how many plans, the best so far, one is drawn whose loads are made again.
     parents: int = 3
     # How many plans are handed on.
-    candidates: int = 4
+    candidates: int = 13
 
     @classmethod
     def by_trial(cls) -> IteratedGreedy:
