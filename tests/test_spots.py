@@ -58,18 +58,6 @@ def test_spots_are_near_what_yields_apart_and_on_nothing() -> None:
     assert (on == 0.0).all()
 
 
-def test_a_truck_stands_where_it_may() -> None:
-    pile = wide_cone()
-    job = make_job(bowl_world, pile, objective="delivery")
-    allowed = np.zeros(pile.height.shape, bool)
-    allowed[:, : allowed.shape[1] // 2 - 60] = True
-    places = places_of(best_spots(job, seed=0, watch=Watch(), allowed=allowed))
-    on, _ = truck_stands_on(places, pile, allowed, WA320)
-    assert len(places) > 0
-    assert (on > 1.0 - 1e-6).all()
-    assert best_spots(job, seed=0, watch=Watch(), allowed=np.zeros_like(allowed)) == []
-
-
 @pytest.mark.slow
 def test_a_plan_says_where_it_has_the_truck() -> None:
     pile: Any = wide_cone()

@@ -58,7 +58,8 @@ class NamedSite:
                 None for the default place.
 
         Raises:
-            InputError: If the place lies on the pile or far away from it.
+            InputError: If the place lies on the pile, far away from it or outside the area for
+                trucks, or there is no room in that.
         """
         from wlplan.planning.placement import beside, place_receiver
         from wlplan.site.site import Site
@@ -72,6 +73,7 @@ class NamedSite:
                 machine=self.machine,
                 contour=named.contour,
                 closed=named.closed,
+                area=named.truck_area,
                 frame=named.frame,
             )
         site = Site(
@@ -79,6 +81,7 @@ class NamedSite:
             soil=self.soil,
             receiver=receiver,
             keep_out=named.closed,
+            truck_area=named.truck_area,
             frame=named.frame,
         )
         return beside(site, named.pile, named.contour)
@@ -93,6 +96,7 @@ class NamedPile:
         contour: Its toe.
         frame: How the local frame lies to the coordinates of the scan.
         closed: Cells that nothing may drive on; None if there are none.
+        truck_area: Polygons that trucks may stand in, in the local frame; None: anywhere.
         fields: What plan.json says about the pile.
     """
 
@@ -100,6 +104,7 @@ class NamedPile:
     contour: ToeContour
     frame: Frame
     closed: Any
+    truck_area: Any
     fields: dict[str, Any]
 
     def local(self, x: float, y: float) -> tuple[float, float]:
@@ -204,7 +209,8 @@ def pile_named(file: PileFile, machine: WheelLoader) -> NamedPile:
         "notes": list(scan.notes),
         **file.reading,
     }
-    return NamedPile(pile, contour, scan.frame, scan.contents.closed, fields)
+    contents = scan.contents
+    return NamedPile(pile, contour, scan.frame, contents.closed, contents.truck_area, fields)
 
 
 def _coarse(cell: float, machine: WheelLoader, name: str) -> tuple[str, ...]:

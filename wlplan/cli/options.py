@@ -226,6 +226,13 @@ READING = {
         help="Polygons in the coordinates of the scan: obstacles, or by their property kind no-go "
         "or no-dig.",
     ),
+    "truck_area": click.option(
+        "--truck-area",
+        metavar="FILE.geojson",
+        default=None,
+        help="Polygons that trucks may stand in, in the coordinates of the scan: a whole truck "
+        "inside one of them. Default: anywhere.",
+    ),
     "include": click.option(
         "--include",
         type=Numbers("X,Y", 2),

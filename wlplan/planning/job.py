@@ -86,8 +86,8 @@ def make_job(
         world=as_pytree(world),
         pile=pile,
         # Nothing that is computed depends on the frame: what is compiled serves all of them. What
-        # is closed to traffic is part of the yard.
-        site=placed.replace(frame=LOCAL, keep_out=None),
+        # is closed to traffic is part of the yard; the truck has its place.
+        site=placed.replace(frame=LOCAL, keep_out=None, truck_area=None),
         objective=objective_of(objective),
         yard=yard_of(pile, placed.machine, placed.keep_out),
         amount=amount,

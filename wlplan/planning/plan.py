@@ -94,7 +94,8 @@ def plan_loads(
         raise InputError("both loads and an amount are given: give one of them.")
     if objective is None:
         objective = amount.objective
-    amount = amount.of(pile, (Site() if site is None else site).soil)
+    site = Site() if site is None else site
+    amount = amount.of(pile, site.soil)
     job = make_job(world, pile, site=site, objective=objective, amount=amount, contour=contour)
     checked = None
     if referee is not None:
@@ -110,7 +111,7 @@ def plan_loads(
             with watch.ending():
                 of_part = with_toe(of_part, None if parts else contour)
                 if truck == "auto" and not parts:
-                    of_part = at_receiver(of_part, _best_spot(of_part, rows, seed, watch))
+                    of_part = at_receiver(of_part, _best_spot(of_part, site, rows, seed, watch))
                     job = at_receiver(job, of_part.site.placed_receiver)
                 if isinstance(part[0], Tonnes):
                     # Until loads were planned, by those that could be made.
@@ -144,10 +145,19 @@ def plan_loads(
     )
 
 
-def _best_spot(job: Job, rows: int, seed: int, watch: Watch) -> Receiver:
-    """Of the job's own and the best few spots that with which greedy costs least a tonne."""
+def _best_spot(job: Job, site: Site, rows: int, seed: int, watch: Watch) -> Receiver:
+    """Of the job's own and the best few spots that with which greedy costs least a tonne.
+
+    Args:
+        job: With its toe.
+        site: What of it is closed, and where trucks may stand.
+        rows: Of a plan.
+        seed: Of everything random.
+        watch: Told what it took.
+    """
     greedy, best, least = planner_of("greedy", job.world), job.site.placed_receiver, math.inf
-    spots = [best, *best_spots(job, seed=seed, watch=watch)]
+    found = best_spots(job, seed=seed, watch=watch, closed=site.keep_out, area=site.truck_area)
+    spots = [best, *found]
     for number, receiver in enumerate(spots):
         watch("truck", number, len(spots), None if number == 0 else least)
         at, quiet = at_receiver(job, receiver), Watch()

@@ -241,6 +241,7 @@ def write_plan_folder(
             simulated.plan,
             receiver=site.placed_receiver,
             ways=[np.array(load["path"]["points"]) for load in document["loads"] if "path" in load],
+            area=site.truck_area,
             frame=site.frame,
             after_title=f"After {count} load{'s' if count > 1 else ''} in the simulator",
         )

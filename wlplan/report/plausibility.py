@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from wlplan.planning.placement import truck_stands_on
+from wlplan.planning.placement import not_for_trucks, place_of, truck_stands_on
 from wlplan.site.frame import Frame
 from wlplan.site.site import Site
-from wlplan.terrain.standing import CLEARED, standing
+from wlplan.terrain.standing import standing
 from wlplan.terrain.steepness import remarks_on_steepness, slopes_of_soil
 from wlplan.types import Characteristics, Pile
 
@@ -151,16 +151,14 @@ def _unseen_ways(loads: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _truck(pile: Pile, site: Site, frame: Frame) -> list[str]:
-    receiver = site.placed_receiver
-    place = np.array([[float(receiver.x), float(receiver.y), float(receiver.heading)]])
-    floor = np.asarray(pile.floor)
-    blocked = np.asarray(pile.height) - floor > CLEARED
-    on, unseen = truck_stands_on(
-        place, pile, blocked | standing(floor, pile.cell_size), site.machine
-    )
+    place = place_of(site.placed_receiver)[None]
+    on, unseen = truck_stands_on(place, pile, not_for_trucks(pile, site.keep_out), site.machine)
     where = frame.place(place[0, 0], place[0, 1])
     if on[0] > 0.0:
-        return [f"the truck that is loaded from {where} stands on the pile or on a structure"]
+        return [
+            f"the truck that is loaded from {where} stands on the pile, on a structure or on "
+            f"closed ground"
+        ]
     if unseen[0] > _UNSEEN_TRUCK:
         return [f"the truck that is loaded from {where} stands where the scan saw nothing"]
     return []

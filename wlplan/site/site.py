@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool
 
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.polygon import Polygon
 from wlplan.site.receiver import Receiver
 from wlplan.site.soil import GRAVEL, Soil
 
@@ -21,6 +22,7 @@ class Site(struct.PyTreeNode):
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     receiver: Receiver | None = None  # None: a place beside whatever pile there is
     keep_out: Bool[Array, "nx ny"] | None = None  # cells of the pile's grid closed to traffic
+    truck_area: tuple[Polygon, ...] | None = None  # a truck stands inside one; None: anywhere
     frame: Frame = struct.field(pytree_node=False, default=LOCAL)  # that everything here is in
 
     @property

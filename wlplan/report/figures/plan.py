@@ -21,9 +21,10 @@ from wlplan.report.figures.relief import (
     view_of,
 )
 from wlplan.report.figures.style import BLUE, frame_map, map_panels
-from wlplan.report.figures.truck import Truck, draw_truck
+from wlplan.report.figures.truck import Truck, draw_area, draw_truck
 from wlplan.report.figures.ways import draw_ways
 from wlplan.site.frame import LOCAL, Frame
+from wlplan.site.polygon import Polygon
 from wlplan.site.receiver import Receiver
 from wlplan.types import LoadingPlan, Pile
 
@@ -35,6 +36,7 @@ def plan_figure(
     *,
     receiver: Receiver | None = None,
     ways: Sequence[Float[np.ndarray, "_ 4"]] = (),
+    area: tuple[Polygon, ...] | None = None,
     frame: Frame = LOCAL,
     after_title: str | None = None,
 ) -> Figure:
@@ -48,6 +50,7 @@ def plan_figure(
         plan: N loadings in order, leaves [N].
         receiver: Where the loader dumps, drawn as a truck across its heading.
         ways: Points of the way of each load: x [m], y [m], heading [rad] and gear.
+        area: Polygons that trucks may stand in; None: anywhere.
         frame: What the coordinates on the axes are in.
         after_title: Title of the second panel; by default the number of loads.
     """
@@ -71,6 +74,8 @@ def plan_figure(
     for panel, pile, title in zip(panels, (before, after), titles, strict=True):
         draw_pile(panel, pile, PILE, norm)
         frame_map(panel, view, title, frame)
+        if area is not None:
+            draw_area(panel, area)
         if truck is not None:
             draw_truck(panel, truck, view)
     draw_ways(panels[0], ways)
@@ -85,5 +90,5 @@ def plan_figure(
     )
     bar.set_label("height above the ground [m]")
     bar.outline.set_visible(False)
-    add_legend(figure, before, ways=bool(ways))
+    add_legend(figure, before, ways=bool(ways), area=area is not None)
     return figure

@@ -7,11 +7,12 @@ import math
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib import patches
 from matplotlib.axes import Axes
-from matplotlib.patches import Polygon
 
-from wlplan.report.figures.style import INK, PALE, add_arrow
+from wlplan.report.figures.style import GREEN, INK, PALE, add_arrow
 from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.polygon import Polygon
 from wlplan.site.receiver import Receiver, truck_outline
 
 # How far a truck may stand outside the view of the pile to widen it, as a part of the longer side;
@@ -65,6 +66,14 @@ class Truck:
         return bool(np.all((self.body > view[0] - reach) & (self.body < view[1] + reach)))
 
 
+def draw_area(panel: Axes, area: tuple[Polygon, ...]) -> None:
+    """The outlines of where trucks may stand, and of the holes in it."""
+    for ring in (ring for polygon in area for ring in polygon):
+        panel.add_patch(
+            patches.Polygon(ring, closed=True, fill=False, edgecolor=GREEN, linewidth=1.2, zorder=5)
+        )
+
+
 def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> None:
     """The truck to scale, or, when it stands far outside the view, an arrow towards it."""
     centre = truck.body.mean(axis=0)
@@ -86,9 +95,13 @@ def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> Non
         )
         return
     panel.add_patch(
-        Polygon(truck.body, closed=True, facecolor=INK, edgecolor="white", linewidth=0.8, zorder=6)
+        patches.Polygon(
+            truck.body, closed=True, facecolor=INK, edgecolor="white", linewidth=0.8, zorder=6
+        )
     )
-    panel.add_patch(Polygon(truck.bed, closed=True, facecolor=PALE, edgecolor="none", zorder=7))
+    panel.add_patch(
+        patches.Polygon(truck.bed, closed=True, facecolor=PALE, edgecolor="none", zorder=7)
+    )
     add_arrow(panel, *truck.way, colour=INK, line=1.6, head=11.0, zorder=7)
     panel.annotate(
         "truck",
