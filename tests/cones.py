@@ -35,7 +35,9 @@ def circle(radius: float = 4.7, n: int = 290) -> ToeContour:
 
 def fill(action: Action) -> jax.Array:
     """1 at the best action, and less with the distance from it."""
-    part = (action_vector(action) - BEST_ACTION) / np.array([0.7, 5.0, 0.7, 5.0])
+    found = action_vector(action)
+    best, size = (jnp.asarray(v, found.dtype) for v in (BEST_ACTION, [0.7, 5.0, 0.7, 5.0]))
+    part = (found - best) / size
     return 1.0 / (1.0 + 4.0 * (part**2).sum())
 
 

@@ -24,6 +24,7 @@ from wlplan.worlds.names import WORLDS, Learned
 
 if TYPE_CHECKING:
     from wlplan.site.frame import Frame
+    from wlplan.site.receiver import Receiver
     from wlplan.site.site import Site
     from wlplan.terrain.toe import ToeContour
     from wlplan.types import Pile, World
@@ -61,8 +62,7 @@ class NamedSite:
             InputError: If the place lies on the pile, far away from it or outside the area for
                 trucks, or there is no room in that.
         """
-        from wlplan.planning.placement import beside, place_receiver
-        from wlplan.site.site import Site
+        from wlplan.planning.placement import place_receiver
 
         receiver = None
         if truck is not None:
@@ -76,6 +76,30 @@ class NamedSite:
                 area=named.truck_area,
                 frame=named.frame,
             )
+        return self._beside(named, receiver)
+
+    def with_receivers(self, named: NamedPile, trucks: list[tuple[float, float, float]]) -> Site:
+        """The site with a receiver for each truck, where a plan has them.
+
+        Args:
+            named: The pile.
+            trucks: x [m] and y [m] in the coordinates of the scan and heading [degree] of each.
+
+        Raises:
+            InputError: If one of them is outside the area for trucks.
+        """
+        import numpy as np
+
+        from wlplan.site.receiver import Receiver
+        from wlplan.xla import floats
+
+        places = [(*named.local(x, y), math.radians(heading)) for x, y, heading in trucks]
+        return self._beside(named, Receiver(*(floats(column) for column in np.array(places).T)))
+
+    def _beside(self, named: NamedPile, receiver: Receiver | None) -> Site:
+        from wlplan.planning.placement import beside
+        from wlplan.site.site import Site
+
         site = Site(
             machine=self.machine,
             soil=self.soil,

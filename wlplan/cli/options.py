@@ -321,7 +321,8 @@ placed_truck_option = click.option(
     "--truck",
     type=PlaceOrAuto(),
     default=None,
-    help=f"{_TRUCK_HELP}; auto: where the planner finds loads cheapest.",
+    help=f"{_TRUCK_HELP}; auto: where the planner finds loads cheapest; each: likewise for each "
+    f"of --trucks anew.",
 )
 out_option = click.option(
     "--out", metavar="DIR", default=None, help="Folder to write to. It is made if it is missing."

@@ -22,7 +22,7 @@ from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.polygon import Polygon
 from wlplan.site.presets import check_machine, check_soil
-from wlplan.site.receiver import Receiver, truck_outline
+from wlplan.site.receiver import Receiver, receiver_for, stands_of, truck_outline
 from wlplan.site.site import Site
 from wlplan.terrain.heightmap import sample
 from wlplan.terrain.standing import CLEARED, standing
@@ -75,7 +75,9 @@ def beside(site: Site, pile: Pile, contour: ToeContour | None = None) -> Site:
     check_soil(site.soil)
     check_machine(site.machine)
     if site.receiver is not None:
-        _check_inside(place_of(site.receiver), site.truck_area, site.machine, site.frame)
+        for _, truck in stands_of(site.receiver):
+            place = place_of(receiver_for(site.receiver, truck))
+            _check_inside(place, site.truck_area, site.machine, site.frame)
         return site
     receiver = best_receiver(
         pile,
@@ -360,10 +362,19 @@ def cost_of_truck(
     return cost
 
 
-def not_for_trucks(pile: Pile, closed: Closed = None) -> Bool[np.ndarray, "nx ny"]:
-    """Cells that a truck must not stand on: soil, what stands there, closed ground."""
+def not_for_trucks(
+    pile: Pile, closed: Closed = None, soil: Bool[np.ndarray, "nx ny"] | None = None
+) -> Bool[np.ndarray, "nx ny"]:
+    """Cells that a truck must not stand on: soil, what stands there, closed ground.
+
+    Args:
+        pile: The pile.
+        closed: Cells of its grid that nothing may drive on.
+        soil: Cells with more soil than can be driven over; None: those of the pile.
+    """
     floor = np.asarray(pile.floor)
-    soil = np.asarray(pile.height) - floor > CLEARED
+    if soil is None:
+        soil = np.asarray(pile.height) - floor > CLEARED
     blocked: np.ndarray = soil | standing(floor, pile.cell_size)
     return blocked if closed is None else blocked | np.asarray(closed)
 

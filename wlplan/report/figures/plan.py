@@ -21,7 +21,7 @@ from wlplan.report.figures.relief import (
     view_of,
 )
 from wlplan.report.figures.style import BLUE, frame_map, map_panels
-from wlplan.report.figures.truck import Truck, draw_area, draw_truck
+from wlplan.report.figures.truck import draw_area, draw_truck, trucks_of
 from wlplan.report.figures.ways import draw_ways
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.polygon import Polygon
@@ -48,7 +48,8 @@ def plan_figure(
         before: Pile before the first loading.
         after: Pile after the last one, on the same grid.
         plan: N loadings in order, leaves [N].
-        receiver: Where the loader dumps, drawn as a truck across its heading.
+        receiver: Where the loader dumps, drawn as a truck across its heading; leaves (K,) for
+            trucks with places of their own.
         ways: Points of the way of each load: x [m], y [m], heading [rad] and gear.
         area: Polygons that trucks may stand in; None: anywhere.
         frame: What the coordinates on the axes are in.
@@ -57,10 +58,11 @@ def plan_figure(
     digs = np.stack([np.asarray(plan.pose.x), np.asarray(plan.pose.y)], axis=-1).astype(float)
     heading = np.asarray(plan.pose.heading, float)
     view = view_of(before, digs)
-    truck = None if receiver is None else Truck(receiver)
+    trucks = [] if receiver is None else trucks_of(receiver)
     seen = digs
-    if truck is not None and truck.is_near(view):
-        seen = np.concatenate([digs, truck.body, truck.way, *(way[:, :2] for way in ways)])
+    near = [part for truck in trucks if truck.is_near(view) for part in (truck.body, truck.way)]
+    if near:
+        seen = np.concatenate([digs, *near, *(way[:, :2] for way in ways)])
     # Labels are as large as the map allows, and the map widens to hold them.
     radius = LABEL_PART * float(np.ptp(view_of(before, seen), axis=0).max())
     labels = label_places(digs, heading, radius, before)
@@ -76,7 +78,7 @@ def plan_figure(
         frame_map(panel, view, title, frame)
         if area is not None:
             draw_area(panel, area)
-        if truck is not None:
+        for truck in trucks:
             draw_truck(panel, truck, view)
     draw_ways(panels[0], ways)
     draw_digs(panels[0], digs, heading, labels, radius)

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from wlplan.report.figures.style import GREEN, INK, PALE, add_arrow
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.polygon import Polygon
-from wlplan.site.receiver import Receiver, truck_outline
+from wlplan.site.receiver import Receiver, receiver_for, stands_of, truck_outline
 
 # How far a truck may stand outside the view of the pile to widen it, as a part of the longer side;
 # one further away becomes an arrow at the border.
@@ -25,6 +25,7 @@ class Truck:
     """A truck that stands across the end of the loader's way; corners and points [m]."""
 
     receiver: Receiver
+    name: str = "truck"
     machine: WheelLoader = WA320
 
     @property
@@ -66,6 +67,11 @@ class Truck:
         return bool(np.all((self.body > view[0] - reach) & (self.body < view[1] + reach)))
 
 
+def trucks_of(receiver: Receiver) -> list[Truck]:
+    """A truck at each of the different places of a receiver."""
+    return [Truck(receiver_for(receiver, truck), who) for who, truck in stands_of(receiver)]
+
+
 def draw_area(panel: Axes, area: tuple[Polygon, ...]) -> None:
     """The outlines of where trucks may stand, and of the holes in it."""
     for ring in (ring for polygon in area for ring in polygon):
@@ -82,7 +88,7 @@ def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> Non
         away = centre - middle
         reach = float(np.min(0.5 * np.ptp(view, axis=0) / np.maximum(np.abs(away), 1e-9)))
         panel.annotate(
-            f"truck\n{np.hypot(*away):.0f} m",
+            f"{truck.name}\n{np.hypot(*away):.0f} m",
             xy=tuple(middle + 0.98 * reach * away),
             xytext=tuple(middle + 0.80 * reach * away),
             ha="center",
@@ -104,7 +110,7 @@ def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> Non
     )
     add_arrow(panel, *truck.way, colour=INK, line=1.6, head=11.0, zorder=7)
     panel.annotate(
-        "truck",
+        truck.name,
         tuple(truck.way[0]),
         textcoords="offset points",
         xytext=tuple(-12.0 * truck.ahead),
