@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cones import SITE, bowl_world, cone
-from test_spots import GREEDY, wide_cone
+from cones import SITE, bowl_world, cone, wide_cone
 
 from wlplan.errors import InputError
 from wlplan.planning.amounts import Loads, Made, Trucks
 from wlplan.planning.job import make_job, with_toe
 from wlplan.planning.plan import plan_loads, play
+from wlplan.planning.planners import Greedy
 from wlplan.planning.playing import PlanResult
 from wlplan.planning.truck_search import TruckSearch, search_of
 from wlplan.report import figures
@@ -25,6 +25,7 @@ from wlplan.site.site import Site
 from wlplan.site.stands import stands
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 
+GREEDY = Greedy(actions=8, refine_steps=10, refined=2, poses_per_metre=0.5)
 # West and east of the cone.
 PLACES = np.array([[-12.5, 4.0, 1.3], [12.5, -4.0, -1.84], [-12.5, 4.0, 1.3]])
 

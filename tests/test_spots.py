@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cones import bowl_world, cone
+from cones import bowl_world, wide_cone
 
 from wlplan.errors import InputError
 from wlplan.planning.job import make_job
@@ -22,15 +22,6 @@ from wlplan.site.site import Site
 from wlplan.types import Action, Performance, Pile, Pose
 
 GREEDY = Greedy(actions=8, refine_steps=10, refined=2, poses_per_metre=0.5)
-
-
-def wide_cone() -> Pile:
-    """The cone with ground all around that the scan saw."""
-    return (
-        cone(cells=401)
-        .replace(origin=jnp.asarray([-20.0, -20.0]))
-        .replace(height=jnp.roll(cone(cells=401).height, (120, 120), (0, 1)))
-    )
 
 
 def eastern_world(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:

@@ -7,8 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cones import bowl_world, cone
-from test_structures import features, square
+from areas import features, square
+from cones import bowl_world, wide_cone
 
 from wlplan.errors import InputError
 from wlplan.io import read_scan, write_pile
@@ -37,11 +37,7 @@ def box(x0: float, y0: float, x1: float, y1: float, turn: float = 0.0) -> Polygo
 # An L, and a square with a hole in it.
 CORNERED: Polygon = (ring((0, 0), (10, 0), (10, 4), (4, 4), (4, 10), (0, 10)),)
 HOLLOW: Polygon = (*box(-6, -6, 6, 6), *box(-1, -1, 1, 1))
-PILE = (
-    cone(cells=401)
-    .replace(origin=jnp.asarray([-20.0, -20.0]))
-    .replace(height=jnp.roll(cone(cells=401).height, (120, 120), (0, 1)))
-)
+PILE = wide_cone()
 
 
 def receiver(x: float, y: float, heading: float) -> Receiver:
