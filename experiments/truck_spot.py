@@ -1,12 +1,15 @@
-"""What it is worth where the truck stands: the default place and the planner's, for two trucks."""
+"""What it is worth where the trucks stand: the default place, the planner's, one for each."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
+import time
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import wlplan
@@ -14,14 +17,24 @@ from experiments._common.results import main
 from wlplan.io import bundled_pile_path, write_bytes_atomic
 from wlplan.planning.plan import play
 from wlplan.planning.planners import Greedy
+from wlplan.planning.truck_search import TruckSearch
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.style import BLUE, FAINT, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, ORANGE, PALE, new_figure, tidy
 from wlplan.site.site import Site
 from wlplan.types import Pile
 
 SEED_PILES = ("conical", "triangular", "wedge")
 SLOPE_DEGREES, SEEDS = 30.0, (1, 2, 3)
 TRUCKS, PAYLOAD = 2, 24.0
+# Enough trucks that the pile changes, on some of the piles.
+MANY_TRUCKS, MANY_ON = 4, ("bundled", "conical 1", "triangular 2")
+SEARCHES = {
+    "default": None,
+    "auto, not refined": TruckSearch(refine_steps=0),
+    "auto": TruckSearch(),
+    "each": TruckSearch(each=True),
+}
+"""Where the trucks stand, by name."""
 
 
 def piles(preset: str) -> dict[str, Pile]:
@@ -39,37 +52,53 @@ def _seed_pile(kind: str, seed: int) -> Pile:
 
 
 def run(preset: str) -> dict[str, Any]:
-    """Greedy plans in the hybrid world with either truck, played in the simulator."""
-    smoke = preset == "smoke"
-    planner = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3) if smoke else Greedy()
-    amount = wlplan.Trucks(1 if smoke else TRUCKS, 10.0 if smoke else PAYLOAD)
-    hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
+    """Greedy plans in the hybrid world with trucks here and there, played in the simulator."""
     rows = []
     for name, pile in piles(preset).items():
-        for truck in (None, "auto"):
-            plan = wlplan.plan_loads(
-                hybrid, pile, amount=amount, planner=planner, truck="auto" if truck else None
-            )
-            site = Site(receiver=plan.receiver)
-            played = play(
-                simulator, pile, plan.plan, amount=amount, objective="delivery", site=site
-            )
-            rows.append(
-                {
-                    "pile": name,
-                    "truck": truck or "default",
-                    "loads": len(plan.costs),
-                    "model": _summary(plan),
-                    "simulator": _summary(played),
-                    "spent": plan.spent,
-                }
-            )
-            print(json.dumps(rows[-1]), flush=True)
-    return {"trucks": TRUCKS, "payload": PAYLOAD, "planner": "greedy", "rows": rows}
+        kinds = ("default", "auto, not refined", "auto")
+        rows += [one(name, pile, kind, TRUCKS, preset) for kind in kinds]
+        if preset == "smoke" or name in MANY_ON:
+            rows += [one(name, pile, kind, MANY_TRUCKS, preset) for kind in ("auto", "each")]
+    return {"payload": PAYLOAD, "planner": "greedy", "rows": rows}
+
+
+def one(name: str, pile: Pile, kind: str, trucks: int, preset: str) -> dict[str, Any]:
+    """One plan, as it is foreseen and as it is played.
+
+    Args:
+        name: Of the pile.
+        pile: The pile.
+        kind: One of `SEARCHES`.
+        trucks: To be filled.
+        preset: Of the experiment.
+    """
+    search, planner, amount = SEARCHES[kind], Greedy(), wlplan.Trucks(trucks, PAYLOAD)
+    if preset == "smoke":
+        planner = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3)
+        amount = wlplan.Trucks(min(trucks // 2, 2), 5.0)
+        search = search and dataclasses.replace(search, refine_steps=min(search.refine_steps, 1))
+    hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
+    begun = time.perf_counter()
+    plan = wlplan.plan_loads(hybrid, pile, amount=amount, planner=planner, truck=search)
+    site = Site(receiver=plan.receiver)
+    played = play(simulator, pile, plan.plan, amount=amount, objective="delivery", site=site)
+    row = {
+        "pile": name,
+        "truck": kind,
+        "trucks": trucks,
+        "loads": len(plan.costs),
+        "model": _summary(plan),
+        "simulator": _summary(played),
+        "spent": plan.spent,
+        "seconds": time.perf_counter() - begun,
+        "receiver": np.stack([np.asarray(v) for v in jax.tree.leaves(plan.receiver)]).tolist(),
+    }
+    print(json.dumps(row), flush=True)
+    return row
 
 
 def _summary(outcome: wlplan.PlanResult) -> dict[str, float]:
-    """Seconds a tonne without the wait for the second truck, which is the same in all plans."""
+    """Seconds a tonne without the waits for trucks, which are the same in all plans."""
     performance, transport = outcome.rollout.performance, outcome.transport
     mass = float(np.sum(performance.mass))
     digging, driving = float(np.sum(performance.time)), float(np.sum(transport.time))
@@ -83,19 +112,30 @@ def _summary(outcome: wlplan.PlanResult) -> dict[str, float]:
 
 
 def draw(folder: Path) -> None:
-    """Seconds a tonne in the simulator, default beside chosen."""
+    """Seconds a tonne in the simulator, by where the trucks stand."""
     rows = json.loads((folder / "truck_spot.json").read_text())["rows"]
-    names = [row["pile"] for row in rows if row["truck"] == "default"]
-    figure = new_figure(7.0, 3.2)
-    panel = figure.subplots()
-    place = np.arange(len(names))
-    for shift, truck, colour in ((-0.2, "default", FAINT), (0.2, "auto", BLUE)):
-        values = [row["simulator"]["seconds_a_tonne"] for row in rows if row["truck"] == truck]
-        panel.bar(place + shift, values, 0.38, color=colour, label=truck)
-    panel.set_xticks(place, names, rotation=30, ha="right", fontsize=8)
-    panel.set_ylabel("digging and driving [s/t]", fontsize=8)
-    panel.legend(frameon=False, fontsize=8, title="truck", title_fontsize=8)
-    tidy(panel)
+    figure = new_figure(9.0, 3.4)
+    left, right = figure.subplots(1, 2, width_ratios=(3.0, 1.3), sharey=True)
+    colours = {"default": FAINT, "auto, not refined": PALE, "auto": BLUE, "each": ORANGE}
+    for panel, trucks in ((left, TRUCKS), (right, MANY_TRUCKS)):
+        some = [row for row in rows if row["trucks"] == trucks]
+        names = list(dict.fromkeys(row["pile"] for row in some))
+        kinds = [kind for kind in SEARCHES if any(row["truck"] == kind for row in some)]
+        width = 0.8 / max(len(kinds), 1)
+        for number, kind in enumerate(kinds):
+            found = [row for row in some if row["truck"] == kind]
+            at = [
+                names.index(row["pile"]) + (number - 0.5 * (len(kinds) - 1)) * width
+                for row in found
+            ]
+            values = [row["simulator"]["seconds_a_tonne"] for row in found]
+            panel.bar(at, values, 0.95 * width, color=colours[kind], label=kind)
+        panel.set_xticks(np.arange(len(names)), names, rotation=30, ha="right", fontsize=8)
+        panel.set_title(f"{trucks} trucks of {PAYLOAD:g} t", fontsize=9)
+        panel.legend(frameon=False, fontsize=8, ncols=len(kinds), loc="upper right")
+        tidy(panel)
+    left.set_ylim(0.0, 1.2 * max(row["simulator"]["seconds_a_tonne"] for row in rows))
+    left.set_ylabel("digging and driving [s/t]", fontsize=8)
     write_bytes_atomic(folder / "truck_spot.png", png_bytes(figure))
 
 

@@ -21,6 +21,15 @@ def cone(dtype: DTypeLike = jnp.float32, radius: float = 5.0, cells: int = 161) 
     return Pile(jnp.asarray(height, dtype), 0.1, (-8.0, -8.0))
 
 
+def wide_cone() -> Pile:
+    """The cone with ground all around that the scan saw."""
+    return (
+        cone(cells=401)
+        .replace(origin=jnp.asarray([-20.0, -20.0]))
+        .replace(height=jnp.roll(cone(cells=401).height, (120, 120), (0, 1)))
+    )
+
+
 def circle(radius: float = 4.7, n: int = 290) -> ToeContour:
     """The toe of the cone where it rises by TOE_RISE."""
     angle = 2 * np.pi * np.arange(n) / n
@@ -35,7 +44,9 @@ def circle(radius: float = 4.7, n: int = 290) -> ToeContour:
 
 def fill(action: Action) -> jax.Array:
     """1 at the best action, and less with the distance from it."""
-    part = (action_vector(action) - BEST_ACTION) / np.array([0.7, 5.0, 0.7, 5.0])
+    found = action_vector(action)
+    best, size = (jnp.asarray(v, found.dtype) for v in (BEST_ACTION, [0.7, 5.0, 0.7, 5.0]))
+    part = (found - best) / size
     return 1.0 / (1.0 + 4.0 * (part**2).sum())
 
 

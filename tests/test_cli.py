@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from areas import features, square
 from matplotlib.figure import Figure
 from pages import Page
 
@@ -24,7 +25,9 @@ from wlplan.planning import objective
 from wlplan.planning import plan as planner
 from wlplan.planning.amounts import Loads, amount_fields
 from wlplan.planning.loading import Transport
+from wlplan.planning.placement import place_of
 from wlplan.planning.playing import PlanResult
+from wlplan.planning.truck_area import stands_inside
 from wlplan.report import figures as plots
 from wlplan.report import page as report
 from wlplan.site.frame import Frame
@@ -311,7 +314,39 @@ def test_a_truck_may_be_left_to_the_planner(
 ) -> None:
     assert run("plan", scan, "--loads", 1, "--truck", "auto")[0] == 0
     assert run("plan", scan, "--loads", 1)[0] == 0
-    assert [call["truck"] for call in calls] == ["auto", None]
+    assert run("plan", scan, "--trucks", 2, "--payload", 9, "--truck", "each")[0] == 0
+    assert [call["truck"] for call in calls] == ["auto", None, "each"]
+    refused(run("plan", scan, "--loads", 1, "--truck", "all"), "auto|each")
+
+
+def test_an_area_for_trucks_is_kept_to_and_recorded(
+    run: Run, scan: str, tmp_path: Path, calls: list[dict[str, Any]], real_figures: None
+) -> None:
+    path = tmp_path / "trucks.geojson"
+    path.write_text(features((square(-30.0, 7.0, 14.0), {})))
+    area = ("--truck-area", path)
+    assert run("plan", scan, "--loads", 1, *area, "--out", tmp_path / "out")[0] == 0
+    place = place_of(calls[0]["site"].receiver)
+    ring = np.array(square(-30.0, 7.0, 14.0))
+    assert stands_inside(place[None], ((ring,),), WA320)[0]
+    document = json.loads((tmp_path / "out" / "plan.json").read_text())
+    assert document["pile"]["truck_area"] == str(path)
+    # Played again it is known from the plan, and holds for another place.
+    again = ("simulate", scan, tmp_path / "out" / "plan.json")
+    assert run(*again)[0] == 0
+    elsewhere = ("--truck", "12,0,0")
+    outside = run(*again, *elsewhere), run("plan", scan, *area, *elsewhere)
+    path.write_text(features((square(-30.0, 7.0, 4.0), {})))
+    small = run("plan", scan, *area)
+    for (code, out, err), words in (
+        *((told, "12.0, 0.0, heading 0°, does not stand inside the area") for told in outside),
+        (small, "no truck, 7.0 m by 2.6 m, fits"),
+    ):
+        assert (code, out) == (2, "")
+        # Notes on the scan come first.
+        (line,) = [line for line in err.splitlines() if not line.startswith("note: ")]
+        assert line.startswith("error: ")
+        assert words in line
 
 
 def test_an_interrupted_search_is_shown_written_and_told(
@@ -466,6 +501,32 @@ def test_a_plan_for_another_pile_is_told(run: Run, scan: str, tmp_path: Path) ->
     code, _, err = run("simulate", scan, tmp_path / "out" / "plan.json")
     assert code == 0
     assert "another pile" in err
+
+
+def test_trucks_with_places_of_their_own_are_played_there(
+    run: Run, scan: str, tmp_path: Path
+) -> None:
+    run("plan", scan, "--loads", 3, "--truck", "-12,1,30", "--out", tmp_path / "out")
+    plan = json.loads((tmp_path / "out" / "plan.json").read_text())
+    places = [{"x": -12.0, "y": 1.0, "heading": 0.5}, {"x": 11.0, "y": -3.0, "heading": 3.0}]
+
+    def played(trucks: list[dict[str, Any]]) -> tuple[dict[str, Any], str]:
+        (tmp_path / "plan.json").write_text(json.dumps({**plan, "trucks": trucks}))
+        code, out, _ = run("simulate", scan, tmp_path / "plan.json")
+        assert code == 0
+        return json.loads(run("simulate", scan, tmp_path / "plan.json", "--json")[1]), out
+
+    document, out = played([{**places[0], "loads": [0, 1]}, {**places[1], "loads": [2]}])
+    found = [{name: truck[name] for name in places[0]} for truck in document["trucks"]]
+    for truck, place in zip(found, places, strict=True):
+        assert truck == pytest.approx(place, abs=1e-5)
+    assert document["receiver"] == pytest.approx(places[0], abs=1e-5)
+    assert "truck 1: the loader dumps at -12.0, 1.0, heading 29°" in out
+    assert "truck 2: the loader dumps at 11.0, -3.0, heading 172°" in out
+    # Trucks without places stand at that of the plan.
+    document, out = played([{"loads": [0, 1]}, {"loads": [2]}])
+    assert {truck["x"] for truck in document["trucks"]} == {plan["receiver"]["x"]}
+    assert "truck: the loader dumps at -12.0, 1.0, heading 30°" in out
 
 
 def survey(folder: Path, name: str, west: float) -> Path:

@@ -1,7 +1,6 @@
 """What is not soil: found where it stands, left standing, and no way through it."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from areas import features, square
 from laws import assert_volume_kept, volume
 
 import wlplan
@@ -177,26 +177,6 @@ def test_what_was_taken_out_can_be_put_back(tmp_path: Path) -> None:
     assert float(volume(soil.pile)) > float(volume(read_scan(path).pile)) + 50.0
     with pytest.raises(InputError, match="nothing stands at 2"):
         read_scan(path, include=(2.0, 2.0))
-
-
-def features(*polygons: tuple[list[list[float]], dict[str, Any]]) -> str:
-    return json.dumps(
-        {
-            "type": "FeatureCollection",
-            "features": [
-                {
-                    "type": "Feature",
-                    "properties": properties,
-                    "geometry": {"type": "Polygon", "coordinates": [ring]},
-                }
-                for ring, properties in polygons
-            ],
-        }
-    )
-
-
-def square(x: float, y: float, side: float) -> list[list[float]]:
-    return [[x, y], [x + side, y], [x + side, y + side], [x, y + side], [x, y]]
 
 
 def test_areas_that_people_draw(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from wlplan.worlds.names import WORLDS, Learned
 
 if TYPE_CHECKING:
     from wlplan.site.frame import Frame
+    from wlplan.site.receiver import Receiver
     from wlplan.site.site import Site
     from wlplan.terrain.toe import ToeContour
     from wlplan.types import Pile, World
@@ -58,10 +59,10 @@ class NamedSite:
                 None for the default place.
 
         Raises:
-            InputError: If the place lies on the pile or far away from it.
+            InputError: If the place lies on the pile, far away from it or outside the area for
+                trucks, or there is no room in that.
         """
-        from wlplan.planning.placement import beside, place_receiver
-        from wlplan.site.site import Site
+        from wlplan.planning.placement import place_receiver
 
         receiver = None
         if truck is not None:
@@ -72,13 +73,39 @@ class NamedSite:
                 machine=self.machine,
                 contour=named.contour,
                 closed=named.closed,
+                area=named.truck_area,
                 frame=named.frame,
             )
+        return self._beside(named, receiver)
+
+    def with_receivers(self, named: NamedPile, trucks: list[tuple[float, float, float]]) -> Site:
+        """The site with a receiver for each truck, where a plan has them.
+
+        Args:
+            named: The pile.
+            trucks: x [m] and y [m] in the coordinates of the scan and heading [degree] of each.
+
+        Raises:
+            InputError: If one of them is outside the area for trucks.
+        """
+        import numpy as np
+
+        from wlplan.site.receiver import Receiver
+        from wlplan.xla import floats
+
+        places = [(*named.local(x, y), math.radians(heading)) for x, y, heading in trucks]
+        return self._beside(named, Receiver(*(floats(column) for column in np.array(places).T)))
+
+    def _beside(self, named: NamedPile, receiver: Receiver | None) -> Site:
+        from wlplan.planning.placement import beside
+        from wlplan.site.site import Site
+
         site = Site(
             machine=self.machine,
             soil=self.soil,
             receiver=receiver,
             keep_out=named.closed,
+            truck_area=named.truck_area,
             frame=named.frame,
         )
         return beside(site, named.pile, named.contour)
@@ -93,6 +120,7 @@ class NamedPile:
         contour: Its toe.
         frame: How the local frame lies to the coordinates of the scan.
         closed: Cells that nothing may drive on; None if there are none.
+        truck_area: Polygons that trucks may stand in, in the local frame; None: anywhere.
         fields: What plan.json says about the pile.
     """
 
@@ -100,6 +128,7 @@ class NamedPile:
     contour: ToeContour
     frame: Frame
     closed: Any
+    truck_area: Any
     fields: dict[str, Any]
 
     def local(self, x: float, y: float) -> tuple[float, float]:
@@ -204,7 +233,8 @@ def pile_named(file: PileFile, machine: WheelLoader) -> NamedPile:
         "notes": list(scan.notes),
         **file.reading,
     }
-    return NamedPile(pile, contour, scan.frame, scan.contents.closed, fields)
+    contents = scan.contents
+    return NamedPile(pile, contour, scan.frame, contents.closed, contents.truck_area, fields)
 
 
 def _coarse(cell: float, machine: WheelLoader, name: str) -> tuple[str, ...]:

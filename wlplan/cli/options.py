@@ -226,6 +226,13 @@ READING = {
         help="Polygons in the coordinates of the scan: obstacles, or by their property kind no-go "
         "or no-dig.",
     ),
+    "truck_area": click.option(
+        "--truck-area",
+        metavar="FILE.geojson",
+        default=None,
+        help="Polygons that trucks may stand in, in the coordinates of the scan: a whole truck "
+        "inside one of them. Default: anywhere.",
+    ),
     "include": click.option(
         "--include",
         type=Numbers("X,Y", 2),
@@ -314,7 +321,8 @@ placed_truck_option = click.option(
     "--truck",
     type=PlaceOrAuto(),
     default=None,
-    help=f"{_TRUCK_HELP}; auto: where the planner finds loads cheapest.",
+    help=f"{_TRUCK_HELP}; auto: where the planner finds loads cheapest; each: likewise for each "
+    f"of --trucks anew.",
 )
 out_option = click.option(
     "--out", metavar="DIR", default=None, help="Folder to write to. It is made if it is missing."

@@ -9,6 +9,7 @@ from typing import Any
 from wlplan.cli.outputs import print_table, remark, titled_table
 from wlplan.constants import QUANTITIES
 from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error
+from wlplan.report.stands import stands_of
 from wlplan.site.frame import frame_recorded
 
 
@@ -71,6 +72,9 @@ def print_plan(document: Mapping[str, Any]) -> None:
         passes = len(truck["loads"])
         of = f" of {truck['payload']:g} t" if "payload" in truck else ""
         print(f"truck {number}: {truck['mass']:.1f} t{of} in {passes} load{'s'[: passes > 1]}")
+    for who, stand in stands_of(document):
+        where, into = frame.place(stand["x"], stand["y"]), math.degrees(stand["heading"])
+        print(f"{who}: the loader dumps at {where}, heading {into:.0f}°")
     print(_times(total))
     costs = [f"{part} {total[part]['cost']:.3f}" for part in total if "cost" in total[part]]
     print(f"cost for {document['objective']}: {', '.join(costs)}")

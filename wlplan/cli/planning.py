@@ -39,7 +39,6 @@ from wlplan.cli.options import (
 from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.plan_table import print_plan, remark_on_ledger
 from wlplan.cli.progress import Progress, Stopwatch, ready
-from wlplan.cli.values import AUTO
 from wlplan.constants import QUANTITIES
 from wlplan.planning.objectives import OBJECTIVES
 
@@ -127,7 +126,7 @@ def plan(
                     objective=goal,
                     planner=chosen,
                     site=place,
-                    truck="auto" if truck == AUTO else None,
+                    truck=truck if isinstance(truck, str) else None,
                     seed=seed,
                     referee=simulator if referee and not in_simulator else None,
                     progress=progress,
@@ -263,7 +262,11 @@ def simulate(
     objective = given.get("objective")
     # A plan file must not make us import somebody else's module.
     objective = objective if objective in OBJECTIVES else next(iter(OBJECTIVES))
-    place = site.with_receiver(named, truck if truck is not None else _truck_of(given, frame))
+    places = None if truck is not None else _places_of_trucks(given, frame)
+    if places is None:
+        place = site.with_receiver(named, truck if truck is not None else _truck_of(given, frame))
+    else:
+        place = site.with_receivers(named, places)
     with named_file(Path(plan_file)):
         amount = amount_recorded(given.get("job"))
     cycles: list[Any] = []
@@ -341,6 +344,20 @@ def _truck_of(document: Mapping[str, Any], frame: Frame) -> tuple[float, ...] | 
         return None
     x, y, heading = (float(v) for v in values if v is not None)
     return *frame.scan(x, y), math.degrees(heading)
+
+
+def _places_of_trucks(
+    document: Mapping[str, Any], frame: Frame
+) -> list[tuple[float, float, float]] | None:
+    """The places of trucks that have each its own, as of the option; None for one or none."""
+    from wlplan.report.stands import stands_of
+
+    stands, trucks = stands_of(document), document.get("trucks") or []
+    if len(stands) < 2:
+        return None
+    found = [_truck_of({"receiver": truck}, frame) for truck in trucks]
+    places = [(one[0], one[1], one[2]) for one in found if one is not None and len(one) == 3]
+    return places if len(places) == len(trucks) else None
 
 
 def _predicted_of(document: Mapping[str, Any]) -> Performance | None:

@@ -188,18 +188,18 @@ class LevelOrFile(click.ParamType):  # type: ignore[type-arg]
 
 
 class PlaceOrAuto(Numbers):
-    """A place, or the word for leaving it to the planner."""
+    """A place, or a word for leaving it to the planner."""
 
     def __init__(self) -> None:
-        super().__init__("X,Y[,HEADING_DEG]|auto", 2)
+        super().__init__("|".join(("X,Y[,HEADING_DEG]", *LEFT_TO_THE_PLANNER)), 2)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The numbers of a text, or the word itself."""
-        return value if value == AUTO else super().convert(value, param, ctx)
+        return value if value in LEFT_TO_THE_PLANNER else super().convert(value, param, ctx)
 
 
-AUTO = "auto"
-"""What stands for a truck that the planner places."""
+LEFT_TO_THE_PLANNER = ("auto", "each")
+"""What stands for trucks that the planner places: all in one place, or each in its own."""
 
 
 class FiniteRange(click.FloatRange):

@@ -16,13 +16,16 @@ from wlplan.io.files import check_is_file, named
 KINDS = ("obstacle", "no-go", "no-dig")
 """What an area may be: something stands there; nothing may drive there; nothing is dug there."""
 
+FOR_TRUCKS = ("truck",)
+"""The same of areas that trucks may stand in."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Area:
     """An area of a site.
 
     Attributes:
-        kind: One of `KINDS`.
+        kind: One of `KINDS`, or of `FOR_TRUCKS`.
         rings: Corners of its outline and of its holes [m], in the coordinates of the scan.
         height: Of an obstacle over the floor [m]; None: as the scan saw it.
     """
@@ -58,12 +61,13 @@ class Area:
         return inside
 
 
-def read_areas(path: Path) -> tuple[Area, ...]:
+def read_areas(path: Path, kinds: tuple[str, ...] = KINDS) -> tuple[Area, ...]:
     """The polygons of a GeoJSON file.
 
     Args:
         path: File. Its coordinates are those of the scan; `properties` of a feature may hold
-            `kind`, one of `KINDS`, by default the first, and `height` [m] of an obstacle.
+            `kind`, by default the first of those asked for, and `height` [m] of an obstacle.
+        kinds: Kinds that the areas may be of.
 
     Raises:
         InputError: If it is none, holds no polygon, or one that is none.
@@ -81,20 +85,20 @@ def read_areas(path: Path) -> tuple[Area, ...]:
             features = [document if "geometry" in document else {"geometry": document}]
         if not isinstance(features, list):
             raise InputError("is not GeoJSON: it holds no features.")
-        areas = tuple(area for feature in features for area in _areas(feature))
+        areas = tuple(area for feature in features for area in _areas(feature, kinds))
         if not areas:
             raise InputError("holds no polygon: draw the areas as polygons.")
         return areas
 
 
-def _areas(feature: Any) -> list[Area]:
+def _areas(feature: Any, kinds: tuple[str, ...]) -> list[Area]:
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     properties = feature.get("properties") if isinstance(feature, dict) else None
     properties = properties if isinstance(properties, dict) else {}
-    kind = properties.get("kind", KINDS[0])
-    if kind not in KINDS:
+    kind = properties.get("kind", kinds[0])
+    if kind not in kinds:
         raise InputError(
-            f"has an area of kind {one_line(repr(kind))}: use one of {', '.join(KINDS)}."
+            f"has an area of kind {one_line(repr(kind))}: use one of {', '.join(kinds)}."
         )
     height = properties.get("height")
     if height is not None and not (_is_number(height) and 0.0 < height < 200.0):

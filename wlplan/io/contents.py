@@ -6,14 +6,16 @@ All of it becomes part of the ground, which cannot be moved.
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from wlplan.errors import InputError
-from wlplan.io.areas import KINDS, Area, read_areas
+from wlplan.io.areas import FOR_TRUCKS, KINDS, Area, read_areas
 from wlplan.site.frame import Frame
+from wlplan.site.polygon import Polygon
 from wlplan.terrain.floor import estimate_ground
 from wlplan.terrain.parts import Part, find_parts, part_at
 from wlplan.terrain.structures import Structure, find_structures
@@ -22,6 +24,8 @@ from wlplan.terrain.structures import Structure, find_structures
 _RISE = 0.15
 # How far from a pile it may be asked for, and how many things a note names.
 _NEAR, _NAMED = 5.0, 3
+# How far from the scan an area for trucks may be [m].
+_FARTHEST = 500.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +40,7 @@ class Contents:
         piles: All piles, largest first.
         planned: The one that is dug; None if there is none.
         closed: Cells that nothing may drive on; None if there are none.
+        truck_area: Polygons that trucks may stand in, in the local frame; None: anywhere.
         notes: In words: sentences without their stops.
     """
 
@@ -46,6 +51,7 @@ class Contents:
     piles: tuple[Part, ...]
     planned: Part | None
     closed: Bool[np.ndarray, "nx ny"] | None
+    truck_area: tuple[Polygon, ...] | None
     notes: tuple[str, ...]
 
 
@@ -59,6 +65,7 @@ def contents_of(
     *,
     known_ground: Bool[np.ndarray, "nx ny"] | None = None,
     keep_out: str | None = None,
+    truck_area: str | None = None,
     include: tuple[float, float] | None = None,
     pile: tuple[float, float] | None = None,
 ) -> Contents:
@@ -73,11 +80,12 @@ def contents_of(
         frame: How that lies to the coordinates of the scan.
         known_ground: Where the floor is known; elsewhere it is estimated. None: everywhere.
         keep_out: File of areas, see `read_areas`.
+        truck_area: File of the areas that trucks may stand in, likewise.
         include: x and y of a structure that is soil after all, in the coordinates of the scan.
         pile: x and y of the pile that is dug, likewise; None: the largest.
 
     Raises:
-        InputError: If there is nothing at `include` or `pile`, or `keep_out` cannot be used.
+        InputError: If there is nothing at `include` or `pile`, or a file of areas cannot be used.
     """
     in_scan = origin + np.array(frame.offset[:2])
     notes: list[str] = []
@@ -111,6 +119,10 @@ def contents_of(
         covered = cell_size**2 * float(_union(masks, areas, (kind,), height.shape).sum())
         if covered:
             notes.append(f"{kind}: {covered:.0f} m2 from {keep_out}")
+    for_trucks = None
+    if truck_area is not None:
+        for_trucks = _for_trucks(truck_area, height.shape, cell_size, origin, frame)
+        notes.append(f"trucks stand in {_counted(len(for_trucks), 'area')} of {truck_area}")
     of_piles, parts = find_parts(height - ground, cell_size, origin, rise=_RISE)
     planned = parts[0] if parts else None
     if pile is not None:
@@ -134,8 +146,37 @@ def contents_of(
         piles=parts,
         planned=planned,
         closed=closed if closed.any() else None,
+        truck_area=for_trucks,
         notes=tuple(notes),
     )
+
+
+def _for_trucks(
+    file: str,
+    shape: tuple[int, ...],
+    cell_size: float,
+    origin: Float[np.ndarray, "2"],
+    frame: Frame,
+) -> tuple[Polygon, ...]:
+    """The polygons of a file of areas for trucks, in the local frame."""
+    offset = np.array(frame.offset[:2])
+    polygons = tuple(
+        tuple(ring - offset for ring in area.rings) for area in read_areas(Path(file), FOR_TRUCKS)
+    )
+    last = origin + cell_size * (np.array(shape) - 1.0)
+    corners = np.concatenate([ring for polygon in polygons for ring in polygon])
+    away = float(np.hypot(*np.maximum(np.maximum(origin - corners, corners - last), 0.0).T).min())
+    # One that encloses the scan has its corners far away.
+    if away > _FARTHEST + math.hypot(*np.ptp(corners, axis=0)):
+        raise InputError(
+            f"{file}: the areas for trucks are {away:.0f} m from the scan, which begins at "
+            f"{frame.place(*origin)}: draw them in the coordinates of the scan."
+        )
+    return polygons
+
+
+def _counted(count: int, what: str) -> str:
+    return f"the {what}" if count == 1 else f"{count} {what}s"
 
 
 def _union(

@@ -101,8 +101,9 @@ def read_scan(
             "y", which is turned to be z before anything else, the crop too. Others are for the
             reader of the format, which names them in `OPTIONS`: `band` of a GeoTIFF, `layer` of a
             grid_map. And, in the coordinates of the scan in metres, `keep_out`, a GeoJSON file of
-            areas; `include`, x and y of a structure that is soil; `pile`, x and y of the pile that
-            is dug, by default the largest; asked for, it is the only one that is soil.
+            areas; `truck_area`, one of the areas that trucks may stand in; `include`, x and y of a
+            structure that is soil; `pile`, x and y of the pile that is dug, by default the largest;
+            asked for, it is the only one that is soil.
 
     Returns:
         The pile on the 0.1 m grid, with its ground, and the notes.

@@ -41,7 +41,7 @@ _FARTHEST = 1.0e8
 # taken off [m]: float32 resolves 1 mm at the one and 0.01 mm at the other.
 _FAR = 10_000.0
 # Options that say what a scan holds, see `contents_of`.
-_OF_CONTENTS = ("keep_out", "include", "pile")
+_OF_CONTENTS = ("keep_out", "truck_area", "include", "pile")
 # Slope of the ground as a whole above which a note says so [degrees].
 _SLOPING = 5.0
 _HIGH = 100.0

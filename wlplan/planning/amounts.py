@@ -256,12 +256,21 @@ class Trucks(Amount):
 
     def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
         """As many trucks as a dozen loads fill, at least one."""
+        passes = self._typical_passes(typical)
+        rows = max(_ROWS, passes + _ROWS - _LOADS_AT_ONCE)
+        return self._next(made, max(1, _LOADS_AT_ONCE // passes), rows)
+
+    def next_truck(self, made: Made, typical: float) -> tuple[Amount, int] | None:
+        """The next truck alone, as `part`."""
+        return self._next(made, 1, self._typical_passes(typical) + _ROWS - _LOADS_AT_ONCE)
+
+    def _typical_passes(self, typical: float) -> int:
+        return math.ceil(float(self.payload) / typical)
+
+    def _next(self, made: Made, at_once: int, rows: int) -> tuple[Amount, int] | None:
         left = int(self.count) - made.trucks
         if left <= 0:
             return None
-        passes = math.ceil(float(self.payload) / typical)
-        at_once = max(1, _LOADS_AT_ONCE // passes)
-        rows = max(_ROWS, passes + _ROWS - _LOADS_AT_ONCE)
         # The wait for the truck after the last of this part is part of it.
         return self.replace(count=min(at_once, left), follows=int(at_once < left)), rows
 

@@ -20,6 +20,7 @@ from wlplan.planning.placement import beside
 from wlplan.planning.poses import Toe, pose_at, toe_of
 from wlplan.planning.yard import Yard, yard_of
 from wlplan.site.frame import LOCAL
+from wlplan.site.receiver import receiver_count
 from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour, toe_contour
 from wlplan.types import Action, LoadingPlan, Pile, Pose, World
@@ -86,8 +87,8 @@ def make_job(
         world=as_pytree(world),
         pile=pile,
         # Nothing that is computed depends on the frame: what is compiled serves all of them. What
-        # is closed to traffic is part of the yard.
-        site=placed.replace(frame=LOCAL, keep_out=None),
+        # is closed to traffic is part of the yard; the truck has its place.
+        site=placed.replace(frame=LOCAL, keep_out=None, truck_area=None),
         objective=objective_of(objective),
         yard=yard_of(pile, placed.machine, placed.keep_out),
         amount=amount,
@@ -102,8 +103,14 @@ def with_toe(job: Job, contour: ToeContour | None = None) -> Job:
         contour: Toe of its pile where it is known already; by default it is traced.
 
     Raises:
-        InputError: If there is nothing to dig, or a bucket can start nowhere.
+        InputError: If there is nothing to dig, a bucket can start nowhere, or each truck has a
+            place of its own: plans are made for one.
     """
+    if receiver_count(job.site.placed_receiver):
+        raise InputError(
+            "the site has a receiver for each of several trucks: plan with one, or leave the "
+            "places to the planner."
+        )
     if contour is None:
         contour = toe_contour(job.pile, machine=job.site.machine)
     return job.replace(toe=toe_of(contour, job.site.machine, job.pile.height.dtype))

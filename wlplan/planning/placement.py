@@ -15,12 +15,14 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from wlplan.errors import InputError
 from wlplan.planning.driving import Room, room_of
 from wlplan.planning.lane import lane_touching
+from wlplan.planning.truck_area import nearest_of, places_inside, stands_inside
 from wlplan.planning.way import open_length, way_to
 from wlplan.planning.yard import yard_of
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
+from wlplan.site.polygon import Polygon
 from wlplan.site.presets import check_machine, check_soil
-from wlplan.site.receiver import Receiver, truck_outline
+from wlplan.site.receiver import Receiver, receiver_for, stands_of, truck_outline
 from wlplan.site.site import Site
 from wlplan.terrain.heightmap import sample
 from wlplan.terrain.standing import CLEARED, standing
@@ -54,6 +56,9 @@ _BATCH, _PORTION, _SLACK = 32, 8, 0.5
 Closed: TypeAlias = Bool[ArrayLike, "nx ny"] | None
 """Cells of a grid that nothing may drive on; None if there are none."""
 
+TruckArea: TypeAlias = tuple[Polygon, ...] | None
+"""Polygons that trucks may stand in; None: they may anywhere."""
+
 
 def beside(site: Site, pile: Pile, contour: ToeContour | None = None) -> Site:
     """The site with a receiver: its own, or one beside a pile.
@@ -64,14 +69,23 @@ def beside(site: Site, pile: Pile, contour: ToeContour | None = None) -> Site:
         contour: Its toe where it is known already.
 
     Raises:
-        InputError: If soil or machine make no sense, or there is no place beside the pile since a
-            bucket can start nowhere.
+        InputError: If soil or machine make no sense, the truck is not in its area, there is no room
+            in that, or there is no place beside the pile since a bucket can start nowhere.
     """
     check_soil(site.soil)
     check_machine(site.machine)
     if site.receiver is not None:
+        for _, truck in stands_of(site.receiver):
+            place = place_of(receiver_for(site.receiver, truck))
+            _check_inside(place, site.truck_area, site.machine, site.frame)
         return site
-    receiver = best_receiver(pile, machine=site.machine, contour=contour, closed=site.keep_out)
+    receiver = best_receiver(
+        pile,
+        machine=site.machine,
+        contour=contour,
+        closed=site.keep_out,
+        area=site.truck_area,
+    )
     return site.replace(receiver=receiver)
 
 
@@ -83,6 +97,7 @@ def place_receiver(
     machine: WheelLoader = WA320,
     contour: ToeContour | None = None,
     closed: Closed = None,
+    area: TruckArea = None,
     frame: Frame = LOCAL,
 ) -> Receiver:
     """A receiver at a place.
@@ -94,10 +109,11 @@ def place_receiver(
         machine: What drives there.
         contour: Toe of the pile where it is known already.
         closed: Cells of its grid that nothing may drive on.
+        area: Polygons that trucks may stand in, in the frame of the pile.
         frame: What complaints give places in.
 
     Raises:
-        InputError: If the place lies on the pile or far away from it.
+        InputError: If the place lies on the pile, far away from it or outside the area.
     """
     x, y = (float(value) for value in place)
     size = pile.cell_size * np.array(pile.height.shape)
@@ -120,8 +136,27 @@ def place_receiver(
     if heading is None:
         degrees = np.arange(-180.0, 180.0, _HEADING_STEP)
         places = np.array([[x, y, math.radians(d)] for d in degrees])
+        inside = places[stands_inside(places, area, machine)]
+        if len(inside):
+            # Always as many: what looks at them is compiled for their number.
+            places = inside[np.arange(len(places)) % len(inside)]
         heading = float(_best(places, pile, machine, contour, closed)[2])
-    return Receiver(*point, jnp.asarray(math.remainder(heading, 2.0 * math.pi), dtype))
+    receiver = Receiver(*point, jnp.asarray(math.remainder(heading, 2.0 * math.pi), dtype))
+    _check_inside(place_of(receiver), area, machine, frame)
+    return receiver
+
+
+def _check_inside(
+    place: Float[np.ndarray, "3"], area: TruckArea, machine: WheelLoader, frame: Frame
+) -> None:
+    """Refuses a receiver whose truck is not in its area."""
+    if not stands_inside(place[None], area, machine)[0]:
+        x, y, heading = (float(value) for value in place)
+        raise InputError(
+            f"the truck that is loaded from {frame.place(x, y)}, heading "
+            f"{math.degrees(heading):.0f}°, does not stand inside the area for trucks: give "
+            f"another place, or a larger area."
+        )
 
 
 def best_receiver(
@@ -130,6 +165,7 @@ def best_receiver(
     machine: WheelLoader = WA320,
     contour: ToeContour | None = None,
     closed: Closed = None,
+    area: TruckArea = None,
 ) -> Receiver:
     """The receiver beside a pile from where the ways to the toe nearby are shortest.
 
@@ -140,12 +176,14 @@ def best_receiver(
         machine: What drives there.
         contour: Toe of the pile where it is known already.
         closed: Cells of its grid that nothing may drive on.
+        area: Polygons that trucks may stand in, in the frame of the pile.
 
     Raises:
-        InputError: If a bucket can start nowhere on the toe.
+        InputError: If a bucket can start nowhere on the toe, or there is no room in the area.
     """
     contour = toe_contour(pile, machine=machine) if contour is None else contour
     places = places_around(edge_poses(contour, _LOCATIONS))
+    places = where_allowed(places, pile, machine, closed, area)
     return receiver_at(_best(places, pile, machine, contour, closed), pile)
 
 
@@ -168,6 +206,43 @@ def places_around(digs: Pose) -> Float[np.ndarray, "n 3"]:
         axis=-1,
     ).reshape(-1, 3)
     return places
+
+
+def where_allowed(
+    places: Float[np.ndarray, "n 3"],
+    pile: Pile,
+    machine: WheelLoader,
+    closed: Closed,
+    area: TruckArea,
+) -> Float[np.ndarray, "n 3"]:
+    """Places like those that are given whose trucks are in their area, and stand on nothing there.
+
+    Args:
+        places: x [m], y [m] and heading [rad] of receivers.
+        pile: The pile.
+        machine: What drives there.
+        closed: Cells of its grid that nothing may drive on.
+        area: The polygons; None: the places stay as they are.
+
+    Raises:
+        InputError: If there is no room in the area.
+    """
+    if area is None:
+        return places
+    allowed = places_inside(area, machine)
+    allowed = np.concatenate([allowed, places[stands_inside(places, area, machine)]])
+    on, _ = truck_stands_on(allowed, pile, not_for_trucks(pile, closed), machine)
+    if not (on == 0.0).any():
+        raise InputError(
+            "there is no room in the area for trucks: wherever one fits, it would stand on soil, "
+            "on what stands there or on closed ground; draw the area elsewhere."
+        )
+    return nearest_of(allowed[on == 0.0], places, machine)
+
+
+def place_of(receiver: Receiver) -> Float[np.ndarray, "3"]:
+    """X [m], y [m] and heading [rad] of a receiver, on the host."""
+    return np.array([float(value) for value in (receiver.x, receiver.y, receiver.heading)])
 
 
 def receiver_at(place: Float[np.ndarray, "3"], pile: Pile) -> Receiver:
@@ -194,7 +269,7 @@ def _best(
     room = room_of(yard_of(pile, machine, closed), pile)
     dtype = pile.height.dtype
     at, digs_of = jnp.asarray(places, dtype), jnp.asarray(nearest, dtype)
-    truck = cost_of_truck(places, pile, machine)
+    truck = cost_of_truck(places, pile, machine, closed)
     # The shortest ways come first: once one is found, most of the others need no look.
     lengths = np.asarray(way_lengths(at, digs_of, machine))
     bound = np.sort(lengths, axis=1)[:, :_BEST].mean(axis=1) + truck
@@ -279,15 +354,29 @@ def truck_cells(
 
 
 def cost_of_truck(
-    places: Float[np.ndarray, "n 3"], pile: Pile, machine: WheelLoader
+    places: Float[np.ndarray, "n 3"], pile: Pile, machine: WheelLoader, closed: Closed = None
 ) -> Float[np.ndarray, " n"]:
     """What it costs that a truck stands on something or on unseen ground [m]."""
-    blocked = np.asarray(pile.height - pile.floor) > CLEARED
-    on, unseen = truck_stands_on(
-        places, pile, blocked | standing(np.asarray(pile.floor), pile.cell_size), machine
-    )
+    on, unseen = truck_stands_on(places, pile, not_for_trucks(pile, closed), machine)
     cost: np.ndarray = _TRUCK_ON * on + _TRUCK_UNSEEN * unseen
     return cost
+
+
+def not_for_trucks(
+    pile: Pile, closed: Closed = None, soil: Bool[np.ndarray, "nx ny"] | None = None
+) -> Bool[np.ndarray, "nx ny"]:
+    """Cells that a truck must not stand on: soil, what stands there, closed ground.
+
+    Args:
+        pile: The pile.
+        closed: Cells of its grid that nothing may drive on.
+        soil: Cells with more soil than can be driven over; None: those of the pile.
+    """
+    floor = np.asarray(pile.floor)
+    if soil is None:
+        soil = np.asarray(pile.height) - floor > CLEARED
+    blocked: np.ndarray = soil | standing(floor, pile.cell_size)
+    return blocked if closed is None else blocked | np.asarray(closed)
 
 
 def truck_stands_on(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ from wlplan.errors import InputError
 from wlplan.planning import planners
 from wlplan.planning.amounts import Amount, Loads, Made, Tonnes, Trucks, typical_load
 from wlplan.planning.job import Decisions, Job, Standing, beginning, make_job, with_toe
+from wlplan.planning.joint import at_receiver
 from wlplan.planning.load_search import price_of
 from wlplan.planning.objective import Objective
 from wlplan.planning.playing import (
@@ -26,9 +26,9 @@ from wlplan.planning.playing import (
     outcomes,
 )
 from wlplan.planning.proposals import NothingWorthIt, Planner, Progress, Proposals
-from wlplan.planning.spots import at_receiver, best_spots
+from wlplan.planning.truck_search import TruckSearch, search_of
 from wlplan.planning.watch import Watch
-from wlplan.site.receiver import Receiver
+from wlplan.site.receiver import Receiver, receiver_count
 from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour
 from wlplan.types import LoadingPlan, Pile, World
@@ -47,7 +47,7 @@ def plan_loads(
     objective: str | Objective | Mapping[str, Any] | Callable[..., Any] | None = None,
     planner: str | Planner = "gradient",
     site: Site | None = None,
-    truck: Literal["auto"] | None = None,
+    truck: str | TruckSearch | None = None,
     seed: int = 0,
     referee: World | None = None,
     progress: Progress | None = None,
@@ -68,8 +68,9 @@ def plan_loads(
         planner: A name of `wlplan.planners.NAMES`, or a planner with settings of its own.
         site: Machine, soil and receiver; default: the WA320 in gravel, and a receiver beside the
             pile, see `wlplan.planning.placement`.
-        truck: "auto": the planner chooses where it stands, see `wlplan.planning.spots`; the result
-            says where. None: at the receiver of the site.
+        truck: "auto": the planner chooses where it stands, see `wlplan.planning.truck_search`;
+            "each": for each truck of `Trucks` anew; or a search with settings of its own. The
+            result says where. None: at the receiver of the site.
         seed: Of everything random.
         referee: World that plays the planner's candidates, each dig at the toe of the pile as the
             referee has it by then, and picks the cheapest; the poses of the result are the ones
@@ -94,24 +95,33 @@ def plan_loads(
         raise InputError("both loads and an amount are given: give one of them.")
     if objective is None:
         objective = amount.objective
-    amount = amount.of(pile, (Site() if site is None else site).soil)
+    site = Site() if site is None else site
+    amount = amount.of(pile, site.soil)
     job = make_job(world, pile, site=site, objective=objective, amount=amount, contour=contour)
     checked = None
     if referee is not None:
         checked = make_job(referee, pile, site=job.site, contour=contour).world
-    chosen = planner_of(planner, job.world)
+    chosen, search = planner_of(planner, job.world), search_of(truck)
     watch, made = Watch(progress, budget), Made()
     parts: list[PlanResult] = []
     typical = typical_load(job.site)
-    while not watch.stopped and (part := amount.part(made, typical)) is not None:
+    each = search is not None and search.each
+    if each and not isinstance(amount, Trucks):
+        raise InputError(
+            "a place for each truck goes with an amount of trucks: give how many and their "
+            "payload, or leave one place to the planner."
+        )
+    next_part = amount.next_truck if each and isinstance(amount, Trucks) else amount.part
+    receivers: list[Receiver] = []
+    while not watch.stopped and (part := next_part(made, typical)) is not None:
         of_part, rows = job.replace(amount=part[0]), part[1]
-        proposals = None
+        proposals, found = None, None
         try:
             with watch.ending():
                 of_part = with_toe(of_part, None if parts else contour)
-                if truck == "auto" and not parts:
-                    of_part = at_receiver(of_part, _best_spot(of_part, rows, seed, watch))
-                    job = at_receiver(job, of_part.site.placed_receiver)
+                if search is not None and (search.each or not parts):
+                    found = search.place(of_part, site, rows, seed=seed, watch=watch)
+                    job, of_part = (at_receiver(one, found.receiver) for one in (job, of_part))
                 if isinstance(part[0], Tonnes):
                     # Until loads were planned, by those that could be made.
                     price = _price(parts) if parts else price_of(of_part, seed, watch)
@@ -128,10 +138,11 @@ def plan_loads(
             proposals = Proposals(watch.best.plan)
         if proposals is None:
             break
-        result = choose(of_part, proposals, referee=checked)
+        result = choose(of_part, _with(proposals, found and found.plan), referee=checked)
         if not len(result.costs):
             break
         parts.append(result)
+        receivers.append(of_part.site.placed_receiver)
         made = _made_with(made, result)
         # What is planned next is planned on the pile as the referee has it by then.
         job = job.replace(pile=(result.refereed or result).rollout.pile)
@@ -139,24 +150,30 @@ def plan_loads(
         raise KeyboardInterrupt
     if not parts:
         raise InputError(f"a budget of {budget} loadings is too small for a first plan.")
-    return joined(parts).replace(
-        receiver=job.site.placed_receiver, spent=watch.spent, stopped=watch.stopped
-    )
+    receiver = receivers[0]
+    if each:
+        receiver = jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers)
+    return joined(parts).replace(receiver=receiver, spent=watch.spent, stopped=watch.stopped)
 
 
-def _best_spot(job: Job, rows: int, seed: int, watch: Watch) -> Receiver:
-    """Of the job's own and the best few spots that with which greedy costs least a tonne."""
-    greedy, best, least = planner_of("greedy", job.world), job.site.placed_receiver, math.inf
-    spots = [best, *best_spots(job, seed=seed, watch=watch)]
-    for number, receiver in enumerate(spots):
-        watch("truck", number, len(spots), None if number == 0 else least)
-        at, quiet = at_receiver(job, receiver), Watch()
-        result = choose(at, greedy.propose(at, rows, seed=seed, progress=quiet))
-        watch.spend(loading=quiet.spent)
-        cost = float(result.cost) / max(float(result.rollout.performance.mass.sum()), 1e-3)
-        if cost < least:
-            best, least = receiver, cost
-    return best
+def _with(proposals: Proposals, plan: Decisions | None) -> Proposals:
+    """The proposals, and a plan to pick from besides; not where a planner hands over others."""
+    candidates: Any = proposals.candidates
+    if plan is None:
+        return proposals
+    if jnp.ndim(jax.tree.leaves(candidates)[0]) == 1:
+        candidates = jax.tree.map(lambda leaf: leaf[None], candidates)
+    one = jax.tree.map(lambda leaf: leaf[None], plan)
+    if _shape_of_row(candidates) != _shape_of_row(one):
+        return proposals
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), candidates, one)
+    return proposals._replace(candidates=both)
+
+
+def _shape_of_row(plans: Decisions | LoadingPlan) -> Any:
+    """What plans of one kind and length have in common, leaves [K, ...]."""
+    leaves, tree = jax.tree.flatten(plans)
+    return tree, [leaf.shape[1:] for leaf in leaves]
 
 
 def _price(parts: Sequence[PlanResult]) -> float:
@@ -281,17 +298,26 @@ def play(
         plan: Poses and actions, and the trucks that the loads go to where there are some.
         objective: As for `plan_loads`.
         amount: What the plan was to load, for trucks that wait and loads that do not fit them.
-        site: Machine, soil and receiver, as for `plan_loads`.
+        site: Machine, soil and receiver, as for `plan_loads`; of the receiver leaves (K,) where
+            each truck of the plan has a place of its own.
         note: Called with what is worth knowing, by worlds that play load by load.
         record: `record(number, record)`, called after each loading, counted from 1, by worlds
             that play load by load, with what they record of it.
 
     Raises:
-        InputError: If the world is a name, the plan makes no sense, or a height is not finite.
+        InputError: If the world is a name, the plan makes no sense, a height is not finite, or
+            there are fewer places than trucks.
     """
     check_plan(plan)
     given = Loads(len(plan.pose.x)) if amount is None else amount
     job = make_job(world, pile, site=site, objective=objective, amount=given)
+    places = receiver_count(job.site.placed_receiver)
+    trucks = 0 if plan.truck is None else int(np.max(np.asarray(plan.truck), initial=-1)) + 1
+    if places and not 0 < trucks <= places:
+        raise InputError(
+            f"the site has places for {places} trucks, but the plan is for {trucks}: give one "
+            f"place for all of them, or as many."
+        )
     if hasattr(job.world, "play_load"):
         return _play_load_by_load(job, plan, note, record)
     dtype = pile.height.dtype

@@ -67,7 +67,8 @@ class PlanResult(struct.PyTreeNode):
     ways: Ways | None = None  # leaves (N, ...); None: nobody asked for them
     solves: SolveReport | None = None  # leaves (N,); None: the world does not say
     refereed: PlanResult | None = None  # the same plan played by the referee, if there was one
-    receiver: Receiver | None = None  # where the loader dumps; None: at that of the site
+    # Where the loader dumps, leaves (K,) if each truck has its own place; None: as the site has it.
+    receiver: Receiver | None = None
     # What was evaluated to find it, in loadings, see `watch.EFFORTS`; and what ended that early:
     # "", "budget" or "interrupted".
     spent: float = struct.field(pytree_node=False, default=0.0)
@@ -96,11 +97,11 @@ def assess(
         thorough: Whether the best way is wanted, or a good one.
     """
     pile, room = standing.pile, room_of(job.yard, standing.pile)
-    mass = performance.mass
-    carried, way = transport(pile, one.pose, mass, job.site, room, cusps=cusps, thorough=thorough)
+    mass, site = performance.mass, job.site.of_truck(one.truck)
+    carried, way = transport(pile, one.pose, mass, site, room, cusps=cusps, thorough=thorough)
     step = job.amount.step(standing.done, mass, leaves)
     carried = carried.replace(wait=step.wait)
-    loading = Loading(pile, one.pose, one.action, performance, carried, job.site)
+    loading = Loading(pile, one.pose, one.action, performance, carried, site)
     terms = job.objective.values(loading)
     ways = Ways(
         way, unseen_along(way, job.yard, job.site.machine.turning_radius), packed_soil(pile)

@@ -2,7 +2,7 @@
 
 A spot is judged by the loads that are best with it: of digs all along the toe, each with its best
 action, those that cost least a tonne, the way to the truck included. What a dig yields does not
-depend on the truck, so it is computed once. A spot has to have room for the truck.
+depend on the truck, so it is computed once. A spot has to have room for the truck, in its area.
 """
 
 from __future__ import annotations
@@ -10,17 +10,22 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from wlplan.actions import spread_actions, squash
 from wlplan.planning.job import Job, beginning
+from wlplan.planning.joint import at_receiver
 from wlplan.planning.loading import Loading, Transport
 from wlplan.planning.placement import (
+    Closed,
+    TruckArea,
     cost_of_truck,
+    not_for_trucks,
     places_around,
     receiver_at,
     truck_stands_on,
     way_lengths,
+    where_allowed,
 )
 from wlplan.planning.playing import assess
 from wlplan.planning.watch import Watch
@@ -41,7 +46,12 @@ _TYPICAL = (20.0, 350.0)
 
 
 def best_spots(
-    job: Job, *, seed: int, watch: Watch, allowed: Bool[np.ndarray, "nx ny"] | None = None
+    job: Job,
+    *,
+    seed: int,
+    watch: Watch,
+    closed: Closed = None,
+    area: TruckArea = None,
 ) -> list[Receiver]:
     """The best spots, the very best first.
 
@@ -49,7 +59,11 @@ def best_spots(
         job: World, pile, site, objective and yard; its receiver plays no part.
         seed: Of the actions that are tried.
         watch: Told what it took.
-        allowed: Cells of the pile's grid where a truck may stand; None: anywhere.
+        closed: Cells of the pile's grid that nothing may drive on.
+        area: Polygons that trucks may stand in.
+
+    Raises:
+        InputError: If a bucket can start nowhere, or there is no room in the area.
     """
     pile, machine = job.pile, job.site.machine
     dtype = pile.height.dtype
@@ -64,10 +78,11 @@ def best_spots(
     best = per_tonne.argmin(axis=1)
     value = per_tonne.min(axis=1)
 
-    places = places_around(digs)
-    truck = cost_of_truck(places, pile, machine)
-    if allowed is not None:
-        truck = np.where(_inside(places, allowed, job), truck, np.inf)
+    places = where_allowed(places_around(digs), pile, machine, closed, area)
+    truck = cost_of_truck(places, pile, machine, closed)
+    on, _ = truck_stands_on(places, pile, not_for_trucks(pile, closed), machine)
+    if not on.all():
+        truck = np.where(on == 0.0, truck, np.inf)
     # What a metre of way costs a tonne.
     metre = float(np.median((longer - costs).mean(axis=1) / np.maximum(masses.max(axis=1), 1e-3)))
     apart = np.hypot(*(places[:, None, :2] - poses[None, :, :2]).transpose(2, 0, 1))
@@ -79,8 +94,6 @@ def best_spots(
     bound = each[:, :_BEST].mean(axis=1) + metre * truck
     order = np.argsort(bound)[:_SPOTS]
     order = order[np.isfinite(bound[order])]
-    if not len(order):
-        return []
     rows = np.resize(order, (-(-len(order) // _PORTION), _PORTION))
     found = _costs_of_spots(
         job,
@@ -99,21 +112,6 @@ def best_spots(
         if all(np.hypot(*(places[row, :2] - other[:2])) > _APART for other in chosen):
             chosen.append(places[row])
     return [receiver_at(place, pile) for place in chosen[:TRIED]]
-
-
-def at_receiver(job: Job, receiver: Receiver) -> Job:
-    """A job whose truck stands somewhere else."""
-    moved: Job = job.replace(site=job.site.replace(receiver=receiver))
-    return moved
-
-
-def _inside(
-    places: Float[np.ndarray, "n 3"], allowed: Bool[np.ndarray, "nx ny"], job: Job
-) -> Bool[np.ndarray, " n"]:
-    """Whether the whole truck of receivers stands on allowed cells."""
-    on, off = truck_stands_on(places, job.pile.replace(valid=None), allowed, job.site.machine)
-    inside: np.ndarray = (on > 1.0 - 1e-6) & (off < 1e-6)
-    return inside
 
 
 def _yields_of(

@@ -15,6 +15,7 @@ from wlplan.constants import KG_PER_TONNE, QUANTITIES
 from wlplan.io.plans import plan_to_dict
 from wlplan.planning.amounts import Amount, Trucks, amount_fields
 from wlplan.planning.clearance import clearance
+from wlplan.planning.placement import place_of
 from wlplan.planning.playing import PlanResult
 from wlplan.planning.way import points_of
 from wlplan.planning.yard import unpacked_soil
@@ -88,12 +89,31 @@ def plan_document(
         **origin,
         **job,
         frame=site.frame.fields(),
-        receiver=receiver_fields(site.placed_receiver),
+        receiver=receiver_fields(site.of_truck(0).placed_receiver),
         total=total,
         ledger=ledger_of(before, simulated, site.soil),
     )
-    notes = remarks_on(document, before, site, faces=simulated.faces, seen=seen)
+    notes = remarks_on(
+        document,
+        before,
+        site,
+        faces=simulated.faces,
+        seen=seen,
+        soil=_soil_at_trucks(before, simulated),
+    )
     return {**document, "notes": notes}
+
+
+def _soil_at_trucks(before: Pile, played: PlanResult) -> dict[int, np.ndarray]:
+    """Cells with soil that cannot be driven over when each truck comes, where that is known."""
+    if played.plan.truck is None or played.ways is None:
+        return {}
+    numbers, first = np.unique(np.asarray(played.plan.truck), return_index=True)
+    packed = np.asarray(played.ways.soil)
+    return {
+        int(number): unpacked_soil(packed[n], before.height.shape)
+        for number, n in zip(numbers, first, strict=True)
+    }
 
 
 def trucks_of(played: PlanResult, site: Site, amount: Amount | None) -> list[dict[str, Any]]:
@@ -101,7 +121,7 @@ def trucks_of(played: PlanResult, site: Site, amount: Amount | None) -> list[dic
 
     Args:
         played: The plan as it was played; it says which truck each load goes to.
-        site: With its receiver, which is where the place is said.
+        site: With its receivers, which is where the places are said.
         amount: What was to be loaded, with the payload.
     """
     truck = np.asarray(played.plan.truck)
@@ -112,7 +132,7 @@ def trucks_of(played: PlanResult, site: Site, amount: Amount | None) -> list[dic
             **payload,
             "mass": float(mass[truck == number].sum()),
             "loads": np.flatnonzero(truck == number).tolist(),
-            **receiver_fields(site.placed_receiver),
+            **receiver_fields(site.of_truck(number).placed_receiver),
         }
         for number in range(int(truck.max(initial=-1)) + 1)
     ]
@@ -124,11 +144,10 @@ def paths_of(before: Pile, played: PlanResult, site: Site) -> list[dict[str, Any
     Args:
         before: The pile before the first loading.
         played: The plan as it was played, with its ways.
-        site: Machine and receiver.
+        site: Machine and receivers.
     """
     assert played.ways is not None
-    machine, receiver = site.machine, receiver_fields(site.placed_receiver)
-    to = np.array([receiver[name] for name in RECEIVER_FIELDS])
+    machine, truck = site.machine, played.plan.truck
     closed = False if site.keep_out is None else np.asarray(site.keep_out)
     stands, found = closed | standing(np.asarray(before.floor), before.cell_size), []
     ways = jax.tree.map(lambda leaf: np.asarray(leaf), played.ways)
@@ -138,6 +157,7 @@ def paths_of(before: Pile, played: PlanResult, site: Site) -> list[dict[str, Any
         points = points_of(way, machine.turning_radius)
         blocked = stands | unpacked_soil(soil, before.height.shape)
         dig = np.array([axis[n] for axis in pose])
+        to = place_of(site.of_truck(None if truck is None else truck[n]).placed_receiver)
         found.append(
             {
                 "path": {
@@ -241,6 +261,7 @@ def write_plan_folder(
             simulated.plan,
             receiver=site.placed_receiver,
             ways=[np.array(load["path"]["points"]) for load in document["loads"] if "path" in load],
+            area=site.truck_area,
             frame=site.frame,
             after_title=f"After {count} load{'s' if count > 1 else ''} in the simulator",
         )

@@ -20,6 +20,7 @@ from jinja2 import ChainableUndefined, Environment, Template
 from wlplan.constants import QUANTITIES, Quantity
 from wlplan.io import write_text_atomic
 from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error, volume_lost
+from wlplan.report.stands import stands_of
 from wlplan.site.frame import frame_recorded
 
 REPORT_NAME = "report.html"
@@ -69,6 +70,7 @@ def render_report(
         document=document,
         offset=frame_recorded(document).offset,
         quantities=QUANTITIES,
+        stands=stands_of(document),
         cards=_CARDS,
         ledger={
             "lost": volume_lost(ledger),

@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from wlplan.planning.placement import truck_stands_on
-from wlplan.site.frame import Frame
+from wlplan.planning.placement import not_for_trucks, place_of, truck_stands_on
+from wlplan.site.receiver import stands_of
 from wlplan.site.site import Site
-from wlplan.terrain.standing import CLEARED, standing
+from wlplan.terrain.standing import standing
 from wlplan.terrain.steepness import remarks_on_steepness, slopes_of_soil
 from wlplan.types import Characteristics, Pile
 
@@ -34,16 +34,19 @@ def remarks_on(
     *,
     faces: Characteristics | None = None,
     seen: tuple[Characteristics, Characteristics] | None = None,
+    soil: Mapping[int, np.ndarray] | None = None,
 ) -> list[str]:
     """What is worth knowing of a plan, sentences without their stops.
 
     Args:
         document: Content of its plan.json.
         pile: The pile before the first loading.
-        site: With its receiver.
+        site: With its receivers.
         faces: Characteristics of the faces that are dug, leaves [N], if they are known.
         seen: The least and the largest that the model that predicted was trained on, if there is
             one that says so.
+        soil: Cells with soil that cannot be driven over when a truck comes, by the truck, counted
+            from 0; for others those of the pile.
     """
     loads = document["loads"]
     return [
@@ -54,7 +57,7 @@ def remarks_on(
         *_new_faces(faces, seen),
         *_tight(loads),
         *_unseen_ways(loads),
-        *_truck(pile, site, site.frame),
+        *_places_of_trucks(pile, site, soil or {}),
         *_steep(pile, site),
     ]
 
@@ -150,17 +153,24 @@ def _unseen_ways(loads: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def _truck(pile: Pile, site: Site, frame: Frame) -> list[str]:
-    receiver = site.placed_receiver
-    place = np.array([[float(receiver.x), float(receiver.y), float(receiver.heading)]])
-    floor = np.asarray(pile.floor)
-    blocked = np.asarray(pile.height) - floor > CLEARED
-    on, unseen = truck_stands_on(
-        place, pile, blocked | standing(floor, pile.cell_size), site.machine
-    )
-    where = frame.place(place[0, 0], place[0, 1])
+def _places_of_trucks(pile: Pile, site: Site, soil: Mapping[int, np.ndarray]) -> list[str]:
+    return [
+        remark
+        for _, truck in stands_of(site.placed_receiver)
+        for remark in _truck(pile, site.of_truck(truck), soil.get(truck))
+    ]
+
+
+def _truck(pile: Pile, site: Site, soil: np.ndarray | None) -> list[str]:
+    place = place_of(site.placed_receiver)[None]
+    blocked = not_for_trucks(pile, site.keep_out, soil)
+    on, unseen = truck_stands_on(place, pile, blocked, site.machine)
+    where = site.frame.place(place[0, 0], place[0, 1])
     if on[0] > 0.0:
-        return [f"the truck that is loaded from {where} stands on the pile or on a structure"]
+        return [
+            f"the truck that is loaded from {where} stands on the pile, on a structure or on "
+            f"closed ground"
+        ]
     if unseen[0] > _UNSEEN_TRUCK:
         return [f"the truck that is loaded from {where} stands where the scan saw nothing"]
     return []

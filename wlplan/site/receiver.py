@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, no_type_check
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 from flax import struct
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from wlplan.site.machine import WheelLoader
+from wlplan.site.stands import stands
 
 
 @no_type_check
 class Receiver(struct.PyTreeNode):
-    """Where the middle of the loader is when it dumps into the truck or hopper, world frame."""
+    """Where the middle of the loader is when it dumps into the truck or hopper, world frame.
 
-    x: Float[Array, ""]  # [m]
-    y: Float[Array, ""]  # [m]
-    heading: Float[Array, ""]  # [rad]
+    Of plans whose trucks stand in different places the leaves are (K,): one for each truck in turn.
+    """
+
+    x: Float[Array, "*trucks"]  # [m]
+    y: Float[Array, "*trucks"]  # [m]
+    heading: Float[Array, "*trucks"]  # [rad]
 
     if TYPE_CHECKING:
 
@@ -36,3 +43,22 @@ def truck_outline(machine: WheelLoader) -> tuple[float, float, float]:
     """
     near = 0.5 * machine.length - machine.overhang + _TRUCK_GAP
     return near, near + _TRUCK_WIDTH, 0.5 * _TRUCK_LENGTH
+
+
+def receiver_count(receiver: Receiver) -> int:
+    """Trucks that have a place of their own; 0: there is one place for all."""
+    return 0 if np.ndim(receiver.x) == 0 else len(receiver.x)
+
+
+def receiver_for(receiver: Receiver, truck: Int[Array, ""] | int) -> Receiver:
+    """The receiver of a truck, counted from 0; of a load that is not made any of them."""
+    if receiver_count(receiver) == 0:
+        return receiver
+    picked: Receiver = jax.tree.map(lambda leaf: jnp.asarray(leaf)[jnp.maximum(truck, 0)], receiver)
+    return picked
+
+
+def stands_of(receiver: Receiver) -> list[tuple[str, int]]:
+    """Who stands at each of the different places, in words, and the first of these trucks."""
+    columns = [np.atleast_1d(np.asarray(leaf)).tolist() for leaf in jax.tree.leaves(receiver)]
+    return stands(list(zip(*columns, strict=True)))

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import no_type_check
 
 from flax import struct
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
-from wlplan.site.receiver import Receiver
+from wlplan.site.polygon import Polygon
+from wlplan.site.receiver import Receiver, receiver_for
 from wlplan.site.soil import GRAVEL, Soil
 
 
@@ -21,6 +22,7 @@ class Site(struct.PyTreeNode):
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     receiver: Receiver | None = None  # None: a place beside whatever pile there is
     keep_out: Bool[Array, "nx ny"] | None = None  # cells of the pile's grid closed to traffic
+    truck_area: tuple[Polygon, ...] | None = None  # a truck stands inside one; None: anywhere
     frame: Frame = struct.field(pytree_node=False, default=LOCAL)  # that everything here is in
 
     @property
@@ -28,3 +30,10 @@ class Site(struct.PyTreeNode):
         """The receiver of a site that is beside a pile."""
         assert self.receiver is not None, "a site has its receiver once it is beside a pile"
         return self.receiver
+
+    def of_truck(self, truck: Int[Array, ""] | int | None) -> Site:
+        """The site as loads of a truck, counted from 0, have it: with the receiver of that one."""
+        if truck is None:
+            return self
+        site: Site = self.replace(receiver=receiver_for(self.placed_receiver, truck))
+        return site

@@ -21,9 +21,10 @@ from wlplan.report.figures.relief import (
     view_of,
 )
 from wlplan.report.figures.style import BLUE, frame_map, map_panels
-from wlplan.report.figures.truck import Truck, draw_truck
+from wlplan.report.figures.truck import draw_area, draw_truck, trucks_of
 from wlplan.report.figures.ways import draw_ways
 from wlplan.site.frame import LOCAL, Frame
+from wlplan.site.polygon import Polygon
 from wlplan.site.receiver import Receiver
 from wlplan.types import LoadingPlan, Pile
 
@@ -35,6 +36,7 @@ def plan_figure(
     *,
     receiver: Receiver | None = None,
     ways: Sequence[Float[np.ndarray, "_ 4"]] = (),
+    area: tuple[Polygon, ...] | None = None,
     frame: Frame = LOCAL,
     after_title: str | None = None,
 ) -> Figure:
@@ -46,18 +48,21 @@ def plan_figure(
         before: Pile before the first loading.
         after: Pile after the last one, on the same grid.
         plan: N loadings in order, leaves [N].
-        receiver: Where the loader dumps, drawn as a truck across its heading.
+        receiver: Where the loader dumps, drawn as a truck across its heading; leaves (K,) for
+            trucks with places of their own.
         ways: Points of the way of each load: x [m], y [m], heading [rad] and gear.
+        area: Polygons that trucks may stand in; None: anywhere.
         frame: What the coordinates on the axes are in.
         after_title: Title of the second panel; by default the number of loads.
     """
     digs = np.stack([np.asarray(plan.pose.x), np.asarray(plan.pose.y)], axis=-1).astype(float)
     heading = np.asarray(plan.pose.heading, float)
     view = view_of(before, digs)
-    truck = None if receiver is None else Truck(receiver)
+    trucks = [] if receiver is None else trucks_of(receiver)
     seen = digs
-    if truck is not None and truck.is_near(view):
-        seen = np.concatenate([digs, truck.body, truck.way, *(way[:, :2] for way in ways)])
+    near = [part for truck in trucks if truck.is_near(view) for part in (truck.body, truck.way)]
+    if near:
+        seen = np.concatenate([digs, *near, *(way[:, :2] for way in ways)])
     # Labels are as large as the map allows, and the map widens to hold them.
     radius = LABEL_PART * float(np.ptp(view_of(before, seen), axis=0).max())
     labels = label_places(digs, heading, radius, before)
@@ -71,7 +76,9 @@ def plan_figure(
     for panel, pile, title in zip(panels, (before, after), titles, strict=True):
         draw_pile(panel, pile, PILE, norm)
         frame_map(panel, view, title, frame)
-        if truck is not None:
+        if area is not None:
+            draw_area(panel, area)
+        for truck in trucks:
             draw_truck(panel, truck, view)
     draw_ways(panels[0], ways)
     draw_digs(panels[0], digs, heading, labels, radius)
@@ -85,5 +92,5 @@ def plan_figure(
     )
     bar.set_label("height above the ground [m]")
     bar.outline.set_visible(False)
-    add_legend(figure, before, ways=bool(ways))
+    add_legend(figure, before, ways=bool(ways), area=area is not None)
     return figure

@@ -139,7 +139,7 @@ def _contour_step(highest: float) -> float:
     return next((s for s in _CONTOUR_STEPS if highest / s >= _LEAST_CONTOURS), _CONTOUR_STEPS[-1])
 
 
-def add_legend(figure: Figure, pile: Pile, *, ways: bool = False) -> None:
+def add_legend(figure: Figure, pile: Pile, *, ways: bool = False, area: bool = False) -> None:
     """One line under the maps that says what their lines mean."""
     parts = [
         f"contour lines every {_contour_step(float(height_above_ground(pile).max())):g} m",
@@ -148,6 +148,8 @@ def add_legend(figure: Figure, pile: Pile, *, ways: bool = False) -> None:
     ]
     if ways:
         parts.append("way to the truck: dashed in reverse, then solid")
+    if area:
+        parts.append("green outline: where trucks may stand")
     if pile.valid is not None and not np.asarray(pile.valid).all():
         parts.append("hatched: not seen by the scan")
     figure.supxlabel("   ·   ".join(parts), fontsize=8.5, color=FAINT)

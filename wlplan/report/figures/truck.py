@@ -7,12 +7,13 @@ import math
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib import patches
 from matplotlib.axes import Axes
-from matplotlib.patches import Polygon
 
-from wlplan.report.figures.style import INK, PALE, add_arrow
+from wlplan.report.figures.style import GREEN, INK, PALE, add_arrow
 from wlplan.site.machine import WA320, WheelLoader
-from wlplan.site.receiver import Receiver, truck_outline
+from wlplan.site.polygon import Polygon
+from wlplan.site.receiver import Receiver, receiver_for, stands_of, truck_outline
 
 # How far a truck may stand outside the view of the pile to widen it, as a part of the longer side;
 # one further away becomes an arrow at the border.
@@ -24,6 +25,7 @@ class Truck:
     """A truck that stands across the end of the loader's way; corners and points [m]."""
 
     receiver: Receiver
+    name: str = "truck"
     machine: WheelLoader = WA320
 
     @property
@@ -65,6 +67,19 @@ class Truck:
         return bool(np.all((self.body > view[0] - reach) & (self.body < view[1] + reach)))
 
 
+def trucks_of(receiver: Receiver) -> list[Truck]:
+    """A truck at each of the different places of a receiver."""
+    return [Truck(receiver_for(receiver, truck), who) for who, truck in stands_of(receiver)]
+
+
+def draw_area(panel: Axes, area: tuple[Polygon, ...]) -> None:
+    """The outlines of where trucks may stand, and of the holes in it."""
+    for ring in (ring for polygon in area for ring in polygon):
+        panel.add_patch(
+            patches.Polygon(ring, closed=True, fill=False, edgecolor=GREEN, linewidth=1.2, zorder=5)
+        )
+
+
 def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> None:
     """The truck to scale, or, when it stands far outside the view, an arrow towards it."""
     centre = truck.body.mean(axis=0)
@@ -73,7 +88,7 @@ def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> Non
         away = centre - middle
         reach = float(np.min(0.5 * np.ptp(view, axis=0) / np.maximum(np.abs(away), 1e-9)))
         panel.annotate(
-            f"truck\n{np.hypot(*away):.0f} m",
+            f"{truck.name}\n{np.hypot(*away):.0f} m",
             xy=tuple(middle + 0.98 * reach * away),
             xytext=tuple(middle + 0.80 * reach * away),
             ha="center",
@@ -86,12 +101,16 @@ def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> Non
         )
         return
     panel.add_patch(
-        Polygon(truck.body, closed=True, facecolor=INK, edgecolor="white", linewidth=0.8, zorder=6)
+        patches.Polygon(
+            truck.body, closed=True, facecolor=INK, edgecolor="white", linewidth=0.8, zorder=6
+        )
     )
-    panel.add_patch(Polygon(truck.bed, closed=True, facecolor=PALE, edgecolor="none", zorder=7))
+    panel.add_patch(
+        patches.Polygon(truck.bed, closed=True, facecolor=PALE, edgecolor="none", zorder=7)
+    )
     add_arrow(panel, *truck.way, colour=INK, line=1.6, head=11.0, zorder=7)
     panel.annotate(
-        "truck",
+        truck.name,
         tuple(truck.way[0]),
         textcoords="offset points",
         xytext=tuple(-12.0 * truck.ahead),
