@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t as student
 
@@ -28,6 +29,8 @@ from experiments._common.budgets import OverBudget, Within
 from experiments._common.instances import JOBS, PILES, SITES, SMOKE_JOB, Instance
 from experiments._common.results import PRESETS, RESULTS, write_result
 from wlplan.io import write_bytes_atomic, write_text_atomic
+from wlplan.planning.amounts import Made, typical_load
+from wlplan.planning.job import make_job, with_toe
 from wlplan.planning.planners import (
     CmaEs,
     CrossEntropy,
@@ -40,9 +43,12 @@ from wlplan.planning.planners import (
     TreeSearch,
 )
 from wlplan.planning.proposals import Planner
+from wlplan.planning.truck_search import TruckSearch
+from wlplan.planning.watch import Watch
 from wlplan.plugins import load_object
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.site.receiver import Receiver
 
 ROWS = Path("out") / "planner_benchmark"
 # The best plan known of each instance, beside the results.
@@ -130,18 +136,55 @@ def _rank(run: Run) -> int:
     return of_pile + of_place + of_planner + of_budget + 3 * run.seed
 
 
-def play_run(run: Run, planner: Planner, of_greedy: float | None) -> dict[str, Any]:
+def place_truck(instance: Instance, seed: int, folder: Path) -> Receiver | None:
+    """Where the truck stands if it is free: at one place for all planners; None if it is not.
+
+    Args:
+        instance: Pile, job and site.
+        seed: Of the search.
+        folder: Where places are kept.
+    """
+    if not instance.is_free:
+        return None
+    path = folder / f"{instance.name}.{seed}.json"
+    pile = instance.load_pile()
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        site = instance.site_of(pile)
+        amount = instance.amount.of(pile, site.soil)
+        first = amount.part(Made(), typical_load(site))
+        assert first is not None
+        job = make_job(
+            wlplan.load_world("hybrid"),
+            pile,
+            site=site,
+            objective=amount.objective,
+            amount=first[0],
+        )
+        found = TruckSearch().place(with_toe(job), site, first[1], seed=seed, watch=Watch())
+        place = [float(value) for value in jax.tree.leaves(found.receiver)]
+        write_text_atomic(path, json.dumps(place))
+    return Receiver(*(jnp.asarray(v, pile.height.dtype) for v in json.loads(path.read_text())))
+
+
+def play_run(
+    run: Run, planner: Planner, of_greedy: float | None, receiver: Receiver | None = None
+) -> dict[str, Any]:
     """Plans and plays one run.
 
     Args:
         run: Which one.
         planner: Its planner.
         of_greedy: What a row of a plan takes greedy; None: this is greedy's own.
+        receiver: Where the loader dumps, if the truck is free.
 
     Returns:
         The row; `plan` is None where the budget does not suffice for one.
     """
-    options, pile = run.instance.options(), run.instance.load_pile()
+    pile = run.instance.load_pile()
+    site = run.instance.site_of(pile)
+    if receiver is not None:
+        site = site.replace(receiver=receiver)
     clock, processor = time.perf_counter(), time.process_time()
     _compiled.seconds = 0.0
     row: dict[str, Any] = {**dataclasses.asdict(run.instance), "planner": run.planner}
@@ -151,14 +194,19 @@ def play_run(run: Run, planner: Planner, of_greedy: float | None) -> dict[str, A
     within = Within(planner, ratio, of_greedy, referee=simulator)
     try:
         result = wlplan.plan_loads(
-            hybrid, pile, planner=within, seed=run.seed, referee=simulator, **options
+            hybrid,
+            pile,
+            amount=run.instance.amount,
+            site=site,
+            planner=within,
+            seed=run.seed,
+            referee=simulator,
         )
     except OverBudget:
         return {**row, "plan": None}
     jax.block_until_ready(result.cost)
     assert result.refereed is not None
     assert result.receiver is not None
-    # Of the planner alone, without the search of a place for the truck.
     row |= {"spent": within.spent, "searches": within.searches, "rows": within.rows}
     row |= {"seconds": time.perf_counter() - clock, "processor": time.process_time() - processor}
     row["compiled"] = _compiled.seconds > _WARM
@@ -233,7 +281,8 @@ def work(
             if (row := _read(folder / f"{base.name}.json")) is None:
                 return
             of_greedy = row["spent"] / row["rows"]
-        row = play_run(run, planners[run.planner](), of_greedy)
+        receiver = place_truck(run.instance, run.seed, folder / "places")
+        row = play_run(run, planners[run.planner](), of_greedy, receiver)
         write_text_atomic(folder / f"{run.name}.json", json.dumps(row) + "\n")
         said = {name: value for name, value in row.items() if name != "plan"}
         print(f"{number + 1}/{len(todo)} {json.dumps(said)}", flush=True)

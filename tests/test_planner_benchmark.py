@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from cones import SITE, circle, cone, spoilt_world
@@ -124,8 +123,8 @@ def test_what_was_run_is_not_run_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["prism 0", "cone", "bundled"])
 def test_walls_stand_around_the_soil_and_leave_the_west_open(name: str) -> None:
     instance = Instance(name, "15 loads", "walls")
-    options, pile = instance.options(), instance.load_pile()
-    walls = np.asarray(options["site"].keep_out)
+    pile = instance.load_pile()
+    walls = np.asarray(instance.site_of(pile).keep_out)
     soil = np.asarray(pile.height - pile.floor) > 0.25
     assert walls.any()
     rows, columns = np.nonzero(soil)
@@ -135,7 +134,5 @@ def test_walls_stand_around_the_soil_and_leave_the_west_open(name: str) -> None:
         assert walls[i, :j].any()
         assert walls[i, j:].any()
         assert not walls[:i, j].any()
-    free = dataclasses.replace(instance, site="walls, free truck").options()
-    assert free["truck"] == "auto"
-    assert options["truck"] is None
-    assert jax.tree.leaves(free["site"].receiver) == jax.tree.leaves(options["site"].receiver)
+    assert not instance.is_free
+    assert dataclasses.replace(instance, site="walls, free truck").is_free

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -57,16 +56,23 @@ class Instance:
             part.replace(",", "").replace(" ", "-") for part in dataclasses.astuple(self)
         )
 
-    def options(self) -> dict[str, Any]:
-        """What `wlplan.plan_loads` is given beside world, pile and planner."""
-        pile = self.load_pile()
+    @property
+    def amount(self) -> Amount:
+        """How much is to be loaded."""
+        return (JOBS | _SMOKE)[self.job]
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the truck stands where the planner wants it."""
+        return self.site.endswith("free truck")
+
+    def site_of(self, pile: Pile) -> Site:
+        """The site, the truck at the place that is given."""
         receiver = None
         if self.pile.startswith("prism"):
             receiver = Receiver(*(jnp.asarray(v, pile.height.dtype) for v in _RECEIVER))
         walls = _walls(pile) if self.site.startswith("walls") else None
-        site = beside(Site(receiver=receiver, keep_out=walls), pile)
-        truck = "auto" if self.site.endswith("free truck") else None
-        return {"amount": (JOBS | _SMOKE)[self.job], "site": site, "truck": truck}
+        return beside(Site(receiver=receiver, keep_out=walls), pile)
 
     def load_pile(self) -> Pile:
         """The pile, at rest."""
