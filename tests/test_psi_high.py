@@ -17,6 +17,7 @@ from wlplan.errors import InputError
 from wlplan.models.architecture import ACTIVATIONS, ENCODERS
 from wlplan.models.layers import max_pool, patches, resize
 from wlplan.models.normaliser import Normaliser
+from wlplan.models.components import PrincipalComponents
 from wlplan.models.psi_high import HighPerformanceModel, PsiHigh
 from wlplan.models.storage import load_model, read_description
 from wlplan.site.soil import GRAVEL

@@ -106,7 +106,8 @@ class StallModel(struct.PyTreeNode):
     def log_odds(self, view: Float[Array, "36 36"], action: Float[Array, "4"]) -> Float[Array, ""]:
         """Logarithm of the probability over that of no stall."""
         seen = normalised_view(view, action, self.maps, self.inputs)
-        return nnx.merge(self.graph, self.params)(*seen)
+        odds: Array = nnx.merge(self.graph, self.params)(*seen)
+        return odds
 
     def calibrated(self, slope: float, shift: float) -> StallModel:
         """The model whose log odds are a line over these: slope and shift of Platt's scaling."""

@@ -14,10 +14,19 @@ from wlplan.checks import check_plan
 from wlplan.errors import InputError
 from wlplan.planning import planners
 from wlplan.planning.amounts import Amount, Loads, Made, Tonnes, Trucks, typical_load
-from wlplan.planning.job import Decisions, Job, Standing, beginning, make_job, with_toe
+from wlplan.planning.job import (
+    Decisions,
+    Job,
+    Standing,
+    beginning,
+    check_knows_enough,
+    make_job,
+    with_toe,
+)
 from wlplan.planning.load_search import price_of
 from wlplan.planning.objective import Objective
 from wlplan.planning.playing import (
+    OF_LOADS,
     PlanResult,
     assemble,
     assess,
@@ -96,6 +105,7 @@ def plan_loads(
         objective = amount.objective
     amount = amount.of(pile, (Site() if site is None else site).soil)
     job = make_job(world, pile, site=site, objective=objective, amount=amount, contour=contour)
+    check_knows_enough(job)
     checked = None
     if referee is not None:
         checked = make_job(referee, pile, site=job.site, contour=contour).world
@@ -238,7 +248,7 @@ def _made(job: Job, result: PlanResult) -> PlanResult:
     rows = np.flatnonzero(np.asarray(truck) >= 0)
     of_loads = {
         name: jax.tree.map(lambda leaf: leaf[rows], getattr(result, name))
-        for name in ("plan", "transport", "terms", "misfit", "costs", "faces", "ways", "solves")
+        for name in ("plan", *OF_LOADS)
     }
     performance = jax.tree.map(lambda leaf: leaf[rows], result.rollout.performance)
     made = result.replace(rollout=result.rollout.replace(performance=performance), **of_loads)

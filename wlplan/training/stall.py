@@ -67,8 +67,8 @@ class StallReport:
     bins: list[Bin | None]  # between `EDGES`; None: no cycles
 
     def as_dict(self) -> dict[str, Any]:
-        """The report as JSON has it."""
-        return dataclasses.asdict(self)
+        """The report as JSON has it, with the bounds of the bins."""
+        return {**dataclasses.asdict(self), "edges": list(EDGES)}
 
 
 def train(
