@@ -143,9 +143,9 @@ def _percent(part: object) -> str:
 
 
 def _share(part: object) -> str:
-    """A probability in whole percent; nothing where there is none."""
+    """A probability in whole percent; a dash where there is none."""
     number = _finite(part)
-    return "" if number is None else f"{100.0 * number:.0f}{_NO_BREAK}%"
+    return _DASH if number is None else f"{100.0 * number:.0f}{_NO_BREAK}%"
 
 
 def _plain(value: object) -> str:

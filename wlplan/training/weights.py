@@ -48,7 +48,7 @@ SHIPPED: tuple[Settings, ...] = (
     PsiLowSettings(members=5, hidden=(128,) * 3, dropout=0.0, epochs=40, batch=256),
     PsiHighSettings(members=5, hidden=(256,) * 3, dropout=0.0, epochs=60, batch=256),
     PhiSettings(hidden=(512,) * 3, dropout=0.0, epochs=40, batch=256),
-    StallSettings(hidden=(128,) * 3, dropout=0.0, epochs=30, batch=256),
+    StallSettings(hidden=(128,) * 3, dropout=0.0, epochs=24, batch=256),
 )
 """How the models that ship are trained, apart from the seed."""
 

@@ -120,7 +120,7 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
                 "this world has no predictor of stalls: train one with `wlplan train stall`, and "
                 "give it to LearnedWorld(..., stall=...) or load_world(..., stall=...)."
             )
-        probability: Array = _stall_probability(self, pile, pose, action)
+        probability: Array = _stall_probability(self.stall, pile, pose, action)
         return probability
 
 
@@ -154,6 +154,6 @@ def _deviation(world: LearnedWorld, pile: Pile, pose: Pose, action: Action) -> P
 
 
 @jax.jit
-def _stall_probability(world: LearnedWorld, pile: Pile, pose: Pose, action: Action) -> Array:
-    probability: Array = world.stall(sample_local(pile, pose), action_vector(action))
+def _stall_probability(stall: Any, pile: Pile, pose: Pose, action: Action) -> Array:
+    probability: Array = stall(sample_local(pile, pose), action_vector(action))
     return probability
