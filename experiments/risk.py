@@ -28,7 +28,7 @@ from wlplan.models.storage import read_description
 from wlplan.planning.planners import Greedy
 from wlplan.planning.terms import TERMS
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, GREEN, ORANGE, new_figure, tidy
 from wlplan.training.stall import stall_report
 from wlplan.types import LoadingPlan, Pile
 from wlplan.worlds.shipped import pretrained_path
@@ -41,6 +41,11 @@ CAUTION = {
     **{f"deviation {weight:g}": (0.0, weight) for weight in (0.5, 1.0)},
 }
 """Weights of the terms "stall" and "deviation" beside those of "efficiency", by name."""
+# In each world, the kinds of caution, and how many of the seeds.
+WORLDS = {
+    "hybrid": ((*CAUTION, "none, mended"), len(SEEDS)),
+    "low": (("none", "stall 1", "stall 8", "none, mended"), 2),
+}
 _TIMEOUT = STOP_REASONS.index("timeout")
 
 
@@ -86,39 +91,61 @@ def cases(preset: str) -> list[tuple[str, int, Pile]]:
 
 
 def run(preset: str) -> dict[str, Any]:
-    """Plans and plays all cases with every kind of caution."""
+    """Plans and plays all cases with every kind of caution, in both worlds."""
+    worlds = {"hybrid": (("none", "stall 1"), 1)} if preset == "smoke" else WORLDS
+    rows = []
+    for name, (kinds, seeds) in worlds.items():
+        rows += played(name, [c for c in cases(preset) if c[1] in SEEDS[:seeds]], kinds, preset)
+    return summary(rows)
+
+
+def played(
+    name: str, piles: list[tuple[str, int, Pile]], kinds: tuple[str, ...], preset: str
+) -> list[dict[str, Any]]:
+    """The plans of a world, as foreseen there and as played."""
     smoke = preset == "smoke"
     planner = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3) if smoke else Greedy()
-    kinds = ("none", "stall 1") if smoke else tuple(CAUTION)
-    hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
+    world, simulator = wlplan.load_world(name), wlplan.load_world("simulator")
     objective = wlplan.Objective({**wlplan.OBJECTIVES["efficiency"], "caution": caution})
     rows = []
-    for name, seed, pile in cases(preset):
+    for pile_name, seed, pile in piles:
         for kind in kinds:
             planned = wlplan.plan_loads(
-                Cautious(hybrid, jnp.asarray(CAUTION[kind])),
+                Cautious(world, jnp.asarray(CAUTION[kind.removesuffix(", mended")])),
                 pile,
                 loads=2 if smoke else LOADS,
                 objective=objective,
                 planner=planner,
                 seed=seed,
                 referee=simulator,
+                mend=kind.endswith("mended"),
             )
-            row = _row(hybrid, planned, pile)
-            rows.append({"pile": name, "seed": seed, "caution": kind, **row})
+            head = {"world": name, "pile": pile_name, "seed": seed, "caution": kind}
+            rows.append({**head, **_row(world, planned, pile)})
             print(json.dumps(rows[-1]), flush=True)
+    return rows
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """What all plans together say, and each of them."""
     held_out = read_description(pretrained_path("stall"), "stall")["held_out"]
+    level = [row for row in rows if row["pile"] != "bundled"]
+    of_world: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        of_world.setdefault(row["world"], []).append(row)
     result = {
         "slope_degrees": SLOPE_DEGREES,
         "planner": "greedy",
         "held_out": held_out,
-        "plans": {
-            "without caution": _calibration([r for r in rows if r["caution"] == "none"]),
-            "all": _calibration(rows),
-            "all, level floors": _calibration([r for r in rows if r["pile"] != "bundled"]),
+        "plans": {"all": _calibration(rows), "level floors": _calibration(level)},
+        "caution": {
+            name: {
+                kind: _compared(mine, kind)
+                for kind in dict.fromkeys(row["caution"] for row in mine)
+            }
+            for name, mine in of_world.items()
         },
-        "caution": {kind: _compared(rows, kind) for kind in kinds},
-        "floor": _floors(rows),
+        "floor": {name: _floors(mine) for name, mine in of_world.items()},
     }
     return {**result, "rows": rows}
 
@@ -254,54 +281,65 @@ def _floors(rows: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
 def draw(folder: Path) -> None:
     """Reliability on new cycles and in plans, and what caution changes in the simulator."""
     result = json.loads((folder / "risk.json").read_text())
-    figure = new_figure(9.0, 3.4)
-    left, right = figure.subplots(1, 2)
-    floor = 1e-4
-    left.plot([floor, 1.0], [floor, 1.0], color=FAINT, lw=1.0)
+    figure = new_figure(9.4, 3.4)
+    panels = figure.subplots(1, 1 + len(result["caution"]), squeeze=False)[0]
+    _draw_reliability(panels[0], result)
+    for panel, (world, kinds) in zip(panels[1:], result["caution"].items(), strict=True):
+        names = [name for name in kinds if name != "none"]
+        places = np.arange(len(names))
+        for shift, what, label, colour in (
+            (-0.13, "cost", "cost", BLUE),
+            (0.13, "seconds", "time", ORANGE),
+        ):
+            panel.errorbar(
+                [kinds[name][what]["change"] for name in names],
+                places + shift,
+                xerr=[kinds[name][what]["half_interval"] for name in names],
+                fmt="o",
+                ms=4,
+                color=colour,
+                lw=1.2,
+                label=label,
+            )
+        panel.axvline(0.0, color=FAINT, lw=1.0)
+        panel.set_yticks(places, names, fontsize=8)
+        panel.invert_yaxis()
+        panel.set_title(f"planned in {world}", fontsize=9)
+        panel.set_xlabel("change in the simulator [%]", fontsize=8)
+        tidy(panel)
+    panels[-1].legend(fontsize=8, frameon=False)
+    write_bytes_atomic(folder / "risk.png", png_bytes(figure))
+
+
+def _draw_reliability(panel: Any, result: dict[str, Any]) -> None:
+    """What stalled over what was foreseen, with intervals of 95 %."""
+    least = 1e-5
+    panel.plot([least, 1.0], [least, 1.0], color=FAINT, lw=1.0)
     sources = {
         "new cycles": (result["held_out"], BLUE),
         "loads of plans": (result["plans"]["all"]["before"], ORANGE),
+        "of these, on level floors": (result["plans"]["level floors"]["before"], GREEN),
     }
     for label, (report, colour) in sources.items():
         bins = [one for one in report["bins"] if one is not None]
-        foreseen = np.array([one["foreseen"] for one in bins])
-        stalled = np.array([one["stalled"] for one in bins])
-        counts = np.array([one["cycles"] for one in bins])
-        # Wilson's interval of 95 %.
-        z = 1.96
-        middle = (stalled + z**2 / (2 * counts)) / (1 + z**2 / counts)
-        half = np.sqrt(stalled * (1 - stalled) / counts + z**2 / (4 * counts**2))
-        half *= z / (1 + z**2 / counts)
-        low, high = np.maximum(middle - half, floor), middle + half
-        left.vlines(foreseen, low, high, color=colour, lw=1.2)
-        left.plot(foreseen, np.maximum(stalled, floor), "o", ms=4, color=colour, label=label)
-    left.set_xscale("log")
-    left.set_yscale("log")
-    left.set_xlabel("probability of a stall, foreseen", fontsize=8)
-    left.set_ylabel("part that stalled", fontsize=8)
-    left.legend(fontsize=8, frameon=False)
-    names = [name for name in result["caution"] if name != "none"]
-    places = np.arange(len(names))
-    for shift, what, colour in ((-0.13, "cost", BLUE), (0.13, "seconds", ORANGE)):
-        changes = [result["caution"][name][what] for name in names]
-        right.errorbar(
-            [one["change"] for one in changes],
-            places + shift,
-            xerr=[one["half_interval"] for one in changes],
-            fmt="o",
-            ms=4,
-            color=colour,
-            lw=1.2,
-            label="time" if what == "seconds" else what,
+        foreseen, stalled, counts = (
+            np.array([one[name] for one in bins]) for name in ("foreseen", "stalled", "cycles")
         )
-    right.axvline(0.0, color=FAINT, lw=1.0)
-    right.set_yticks(places, names, fontsize=8)
-    right.invert_yaxis()
-    right.set_xlabel("change in the simulator by caution [%]", fontsize=8)
-    right.legend(fontsize=8, frameon=False)
-    tidy(left)
-    tidy(right)
-    write_bytes_atomic(folder / "risk.png", png_bytes(figure))
+        # Wilson's.
+        z2 = 1.96**2 / counts
+        middle = (stalled + 0.5 * z2) / (1.0 + z2)
+        half = np.sqrt(z2 * stalled * (1.0 - stalled) + 0.25 * z2**2) / (1.0 + z2)
+        panel.vlines(
+            foreseen, np.maximum(middle - half, least), middle + half, color=colour, lw=1.2
+        )
+        panel.plot(foreseen, np.maximum(stalled, least), "o", ms=4, color=colour, label=label)
+    panel.set_xscale("log")
+    panel.set_yscale("log")
+    panel.set_title("stalls", fontsize=9)
+    panel.set_xlabel("probability, foreseen", fontsize=8)
+    panel.set_ylabel("part that stalled", fontsize=8)
+    panel.legend(fontsize=7, frameon=False)
+    tidy(panel)
 
 
 if __name__ == "__main__":

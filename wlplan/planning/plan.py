@@ -24,6 +24,7 @@ from wlplan.planning.job import (
     with_toe,
 )
 from wlplan.planning.load_search import price_of
+from wlplan.planning.mending import mended
 from wlplan.planning.objective import Objective
 from wlplan.planning.playing import (
     OF_LOADS,
@@ -59,6 +60,7 @@ def plan_loads(
     truck: Literal["auto"] | None = None,
     seed: int = 0,
     referee: World | None = None,
+    mend: bool = True,
     progress: Progress | None = None,
     budget: int | None = None,
     contour: ToeContour | None = None,
@@ -84,6 +86,9 @@ def plan_loads(
             referee has it by then, and picks the cheapest; the poses of the result are the ones
             it dug at. A candidate that costs more in `world` than the planner's limit, for the
             gradient planner the greedy plan, is out. None: `world` picks, with its own poses.
+        mend: Whether loads that fail in the referee, though nothing of it was foreseen, are tried
+            there with the actions of others, see `wlplan.planning.mending`; the limit does not
+            hold for that.
         progress: Called as the planner advances.
         budget: Most loadings that a planner of ours may evaluate, see `wlplan.planning.watch`.
         contour: The toe to dig along; default: that of the pile.
@@ -138,7 +143,7 @@ def plan_loads(
             proposals = Proposals(watch.best.plan)
         if proposals is None:
             break
-        result = choose(of_part, proposals, referee=checked)
+        result = choose(of_part, proposals, referee=checked, mend=mend)
         if not len(result.costs):
             break
         parts.append(result)
@@ -204,13 +209,16 @@ def planner_of(planner: str | Planner, world: World) -> Planner:
     return planner
 
 
-def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> PlanResult:
+def choose(
+    job: Job, proposals: Proposals, *, referee: World | None = None, mend: bool = True
+) -> PlanResult:
     """The cheapest of a planner's candidates that costs no more than its limit.
 
     Args:
         job: What was planned for, in the world that planned.
         proposals: What the planner handed over.
         referee: Who picks; None: the job's own world.
+        mend: Whether loads that fail in the referee are mended, see `plan_loads`.
 
     Raises:
         InputError: If no plan has a finite cost.
@@ -222,7 +230,8 @@ def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> P
         if rows.truck is None and not isinstance(job.amount, Loads):
             # The referee is to fill the trucks that were planned for.
             rows = rows.replace(truck=outcomes(job, rows).plan.truck)
-        judged = outcomes(job.replace(world=as_pytree(referee)), rows)
+        refereed = job.replace(world=as_pytree(referee))
+        judged = outcomes(refereed, rows)
         # The toe is where the referee's pile begins, so the poses are the ones it was played with.
         seen = outcomes(job, judged.plan)
     costs = np.asarray(seen.cost)
@@ -234,10 +243,16 @@ def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> P
             "no plan has a finite cost: check the pile for spikes, and the terms of the objective."
         )
     winner = int(np.argmin(np.where(allowed, np.asarray(judged.cost), np.inf)))
-    result = _made(job, _member(seen, winner))
+    best = _member(seen, winner)
     if referee is None:
-        return result
-    return result.replace(refereed=_made(job, _member(judged, winner)))
+        return _made(job, best)
+    played = _member(judged, winner)
+    better = mended(refereed, _member(rows, winner), best, played) if mend else None
+    if better is not None:
+        again = _member(outcomes(job, jax.tree.map(lambda leaf: leaf[None], better.plan)), 0)
+        if np.isfinite(float(again.cost)):
+            best, played = again, better
+    return _made(job, best).replace(refereed=_made(job, played))
 
 
 def _made(job: Job, result: PlanResult) -> PlanResult:
@@ -332,6 +347,5 @@ def _play_load_by_load(
     return assemble(job, jax.tree.map(lambda *leaves: jnp.stack(leaves), *loadings), standing)
 
 
-def _member(batch: PlanResult, k: int) -> PlanResult:
-    member: PlanResult = jax.tree.map(lambda leaf: leaf[k], batch)
-    return member
+def _member(batch: Any, k: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[k], batch)
