@@ -201,6 +201,7 @@ def play_run(
             planner=within,
             seed=run.seed,
             referee=simulator,
+            mend=False,
         )
     except OverBudget:
         return {**row, "plan": None}

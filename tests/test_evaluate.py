@@ -8,15 +8,16 @@ from flax import nnx
 from test_pile_state import model_of
 from test_training import synthetic
 
-from wlplan.cli.evaluated import evaluated, print_times
+from wlplan.cli.evaluated import evaluated, print_stalls, print_times
 from wlplan.dataset import Dataset
 from wlplan.models.normaliser import Normaliser
 from wlplan.models.phi_vae import PhiVae, VaePileStateModel
 from wlplan.models.psi_low import LowPerformanceModel, PsiLow
+from wlplan.models.stall import StallModel
 from wlplan.models.storage import load_model, read_description
 from wlplan.studies.bench.inference import BATCH
 from wlplan.studies.paper import PERFORMANCE, PILE_STATE, SEQUENCE, SEQUENCE_LOADS
-from wlplan.training import evaluate_performance, evaluate_pile_state
+from wlplan.training import evaluate_performance, evaluate_pile_state, evaluate_stalls
 from wlplan.worlds.shipped import pretrained_path
 
 
@@ -64,6 +65,24 @@ def test_an_ensemble_is_timed_with_and_without_its_deviation(
     assert asked == [(1, False), (BATCH, False), (1, True), (BATCH, True)]
     print_times(found["inference"], found["paper"]["inference_s"])
     assert capsys.readouterr().out.count("with the deviation") == 2
+
+
+def test_the_predictor_of_stalls_stands_beside_a_constant(
+    data: Dataset, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = pretrained_path("stall")
+    model = load_model(place, "stall")
+    assert isinstance(model, StallModel)
+    found = evaluated(model, data, read_description(place, "stall"))
+    json.dumps(found, allow_nan=False)
+    assert found["errors"] == evaluate_stalls(model, data).as_dict()
+    assert not found["paper"]
+    assert [record["inputs"] for record in found["inference"]] == [1, BATCH]
+    print_stalls("stall", found["errors"])
+    print_times(found["inference"], None)
+    said = capsys.readouterr().out
+    assert "calibration error" in said
+    assert "paper" not in said
 
 
 @pytest.mark.slow

@@ -56,6 +56,7 @@ DOCUMENT: dict[str, Any] = {
             "predicted": performance(2.2, 9.0, 800.0),
             "simulated": performance(2.0, 10.0, 750.0),
             "transport": {"time": 20.0, "work": 306.0},
+            "stall_probability": 0.12,
         }
         for heading in (2.0, -6.0)
     ],
@@ -100,7 +101,17 @@ def test_a_whole_document_is_shown_without_a_dash() -> None:
     assert DASH not in text
     for heading in ("Mass", "Time", "Work", "Cost", "Loads", "Ledger", "Settings"):
         assert heading in text
-    for value in ("scan.npz", "gravel", "wa320", "mine", "190, 160", "−6.75", "−30°", "12 s"):
+    for value in (
+        "scan.npz",
+        "gravel",
+        "wa320",
+        "mine",
+        "190, 160",
+        "−6.75",
+        "−30°",
+        "12 s",
+        "12\u00a0%",
+    ):
         assert value in text
     assert "Do not rely" not in text
 
@@ -112,7 +123,7 @@ def test_a_number_that_is_not_there_is_a_dash(new: tuple[float | None, ...]) -> 
         for way, value in places(DOCUMENT)
         if way[0] in NUMBERS and isinstance(value, int | float)
     ]
-    assert len(numbers) == 3 + 10 + 4 + 2 * 15
+    assert len(numbers) == 3 + 10 + 4 + 2 * 16
     for way in numbers:
         text = rendered(changed(way, *new)).text
         assert DASH in text, way
@@ -122,6 +133,14 @@ def test_a_number_that_is_not_there_is_a_dash(new: tuple[float | None, ...]) -> 
 def test_a_part_that_is_missing_leaves_a_page() -> None:
     for way, _ in places(DOCUMENT):
         assert "What it does not tell" in rendered(changed(way)).text, way
+
+
+def test_a_world_that_foresees_no_stalls_has_no_column_for_them() -> None:
+    document = copy.deepcopy(DOCUMENT)
+    assert "Stall" in rendered(document).text
+    for load in document["loads"]:
+        del load["stall_probability"]
+    assert "Stall" not in rendered(document).text
 
 
 @pytest.mark.parametrize("document", [{}, {"loads": []}, {"loads": [{}]}, {"ledger": None}])

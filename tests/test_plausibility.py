@@ -44,7 +44,7 @@ def remarks(*loads: dict[str, Any], pile: Pile = PILE, site: Site = SITE) -> lis
 
 
 def test_a_good_plan_needs_no_words() -> None:
-    assert remarks({}, {}) == []
+    assert remarks({}, {"stall_probability": 0.05}) == []
     assert remarks_on(document({}, {}), PILE, SITE, faces=faces(0.5, 0.58), seen=SEEN) == []
 
 
@@ -55,6 +55,7 @@ def test_a_good_plan_needs_no_words() -> None:
         ({"predicted": {"mass": 9.9, "time": 9.0}}, "125 %"),
         ({"predicted": {"mass": 4.4, "time": 3.0}}, "67 %"),
         ({"clearance": -0.4}, "0.4 m in soil"),
+        ({"stall_probability": 0.34}, "up to 34 %"),
         ({"path": {"length": 14.0, "unseen": 8.0}}, "29 % of the ways"),
     ],
 )

@@ -15,9 +15,10 @@ from trainings import check_that_a_killed_one_ends_alike
 from wlplan.dataset import VARIABLES, Dataset
 from wlplan.errors import InputError
 from wlplan.models.architecture import ACTIVATIONS, ENCODERS
+from wlplan.models.components import PrincipalComponents
 from wlplan.models.layers import max_pool, patches, resize
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.psi_high import HighPerformanceModel, PrincipalComponents, PsiHigh
+from wlplan.models.psi_high import HighPerformanceModel, PsiHigh
 from wlplan.models.storage import load_model, read_description
 from wlplan.site.soil import GRAVEL
 from wlplan.terrain.automaton import relax

@@ -74,9 +74,9 @@ def test_every_setting_is_an_option_with_the_defaults_of_the_kinds() -> None:
     names = {field.name for kind in KINDS.values() for field in dataclasses.fields(kind)}
     assert set(options) == names - {"seed"}
     assert all(option.default is None for option in options.values())
-    assert "psi-low, psi-high 150; phi 100; phi-vae 40." in told["epochs"]
+    assert "psi-low, psi-high 150; phi 100; phi-vae 40; stall 30." in told["epochs"]
     assert told["members"].startswith("psi-low, psi-high: ")
-    assert told["hidden"].endswith("phi 512,512; phi-vae 1024,1024.")
+    assert told["hidden"].endswith("phi 512,512; phi-vae 1024,1024; stall 128,128,128.")
 
 
 def test_settings_of_two_kinds_are_never_the_same() -> None:

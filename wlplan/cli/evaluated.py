@@ -19,10 +19,15 @@ def evaluated(model: Any, part: Any, description: Mapping[str, Any]) -> dict[str
         description: Description of the model, see `wlplan.models.storage.read_description`.
     """
     from wlplan.studies.bench.inference import performance_times, pile_state_times
-    from wlplan.training import evaluate_performance, evaluate_pile_state
+    from wlplan.training import evaluate_performance, evaluate_pile_state, evaluate_stalls
 
     kind = description["kind"]
-    if kind in ("phi", "phi_vae"):
+    paper: dict[str, Any]
+    if kind == "stall":
+        times = performance_times(model, part)
+        # The paper has no such predictor.
+        errors, paper = evaluate_stalls(model, part).as_dict(), {}
+    elif kind in ("phi", "phi_vae"):
         times = pile_state_times(model, part)
         errors = evaluate_pile_state(model, part).as_dict()
         # Ours has no post-processing to leave out.
@@ -30,7 +35,7 @@ def evaluated(model: Any, part: Any, description: Mapping[str, Any]) -> dict[str
             plainly = model.replace(blend=False)
             errors["without_blending"] = evaluate_pile_state(plainly, part).as_dict()
         blended, plain = PILE_STATE[True], PILE_STATE[False]
-        paper: dict[str, Any] = {
+        paper = {
             "mean_absolute": blended.mean_absolute,
             "mean_relative": blended.mean_relative,
             "inference_s": blended.inference,
@@ -51,8 +56,8 @@ def evaluated(model: Any, part: Any, description: Mapping[str, Any]) -> dict[str
     return {"errors": errors, "inference": [time.as_dict() for time in times], "paper": paper}
 
 
-def print_times(times: Sequence[Mapping[str, Any]], paper: float) -> None:
-    """Times of one inference and of a batch beside the paper's time of one [s]."""
+def print_times(times: Sequence[Mapping[str, Any]], paper: float | None) -> None:
+    """Times of one inference and of a batch beside the paper's time of one [s], if it has one."""
     table = titled_table("inference, wall-clock time; compiling apart")
     for column in ("", "median", "10 to 90 %", "each input", "compiling"):
         table.add_column(column, justify="left" if not column else "right")
@@ -66,7 +71,8 @@ def print_times(times: Sequence[Mapping[str, Any]], paper: float) -> None:
             f"{1e3 * record['each_s']:.4f} ms",
             f"{record['compile_s']:.1f} s",
         )
-    table.add_row("paper, one input", f"{1e3 * paper:.2f} ms", "", "", "")
+    if paper is not None:
+        table.add_row("paper, one input", f"{1e3 * paper:.2f} ms", "", "", "")
     print_table(table)
 
 
@@ -87,6 +93,30 @@ def print_pile_state(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) 
         result = PILE_STATE[blend]
         relative = f"{100.0 * result.mean_relative:.2f} %"
         table.add_row(name, "", f"{result.mean_absolute:.2f} m³", relative, "")
+    print_table(table)
+
+
+def print_stalls(title: str, report: Mapping[str, Any]) -> None:
+    """How good the probabilities of stalls are, and what of them happened."""
+    table = titled_table(f"{title}: {report['cycles']} cycles, {report['stalled']} stalled")
+    for column in ("", "foreseen", "a constant"):
+        table.add_column(column, justify="left" if not column else "right")
+    scores = {"negative_log_likelihood": "negative log likelihood", "brier": "Brier score"}
+    for name, label in scores.items():
+        table.add_row(label, *(f"{report[of][name]:.4f}" for of in ("score", "constant")))
+    area = report["area_under_curve"]
+    table.add_row("area under the curve", "–" if area is None else f"{area:.4f}", "0.5")
+    error = 100.0 * report["calibration_error"]
+    table.add_row("calibration error", f"{error:.2f} %", "0 %")
+    print_table(table)
+    table = titled_table("probabilities, and what part of the cycles stalled")
+    for column in ("from", "to", "cycles", "foreseen", "stalled"):
+        table.add_column(column, justify="right")
+    for low, high, found in zip(report["edges"], report["edges"][1:], report["bins"], strict=False):
+        if found is not None:
+            parts = (low, high, found["foreseen"], found["stalled"])
+            first, last, *means = (f"{100.0 * part:.2f} %" for part in parts)
+            table.add_row(first, last, str(found["cycles"]), *means)
     print_table(table)
 
 

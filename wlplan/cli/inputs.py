@@ -370,7 +370,8 @@ def world_named(
     )
     recipe = WORLDS[name]
     if isinstance(recipe, Learned):
-        for kind, given in zip(recipe, (model, pile_state), strict=True):
+        models = (recipe.performance, model), (recipe.pile_state, pile_state)
+        for kind, given in models:
             if (kind or given) and _remark_on_training(kind, given, site):
                 break
     return world

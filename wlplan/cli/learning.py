@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,13 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from wlplan.cli.evaluated import evaluated, print_errors, print_pile_state, print_times
+from wlplan.cli.evaluated import (
+    evaluated,
+    print_errors,
+    print_pile_state,
+    print_stalls,
+    print_times,
+)
 from wlplan.cli.inputs import check_is_folder, site_named
 from wlplan.cli.options import PROTOCOLS, site_options, training_options, with_options
 from wlplan.cli.outputs import checked_folder, json_text, remark
@@ -158,6 +164,7 @@ def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
 
 # Kinds of the models that predict the pile state.
 _PILE_STATE = ("phi", "phi_vae")
+_STALL = "stall"
 # Kinds of the models by their names on the command line, where one name stands for all that ship.
 _MODELS = {kind.replace("_", "-"): kind for kind in KINDS}
 _ALL = "all"
@@ -190,9 +197,9 @@ def train(
 ) -> None:
     """Train MODEL on a data set and report its errors on cycles that it has not seen.
 
-    psi-low and psi-high predict the performance of a load. phi and phi-vae predict the pile after
-    it, phi-vae as in the paper. all trains every model that ships, with the settings that it ships
-    with: only --epochs and --seed can be changed.
+    psi-low and psi-high predict the performance of a load, stall how likely it stalls. phi and
+    phi-vae predict the pile after it, phi-vae as in the paper. all trains every model that ships,
+    with the settings that it ships with: only --epochs and --seed can be changed.
 
     If interrupted, the same command continues where it stopped.
     """
@@ -232,12 +239,19 @@ def train(
         click.echo(json_text({"model": model, "out": out, "held_out": report.as_dict()}))
         return
     title = f"{model}, held-out part of {', '.join(data)}"
-    if kind in _PILE_STATE:
-        print_pile_state(title, [("ours", report.as_dict())])
-    else:
-        print_errors(title, report.as_dict())
+    _print_report(kind, title, report.as_dict())
     print(f"training {training.text()}")
     print(f"written: {out}")
+
+
+def _print_report(kind: str, title: str, report: Mapping[str, Any]) -> None:
+    """Errors of a model that was trained."""
+    if kind in _PILE_STATE:
+        print_pile_state(title, [("ours", report)])
+    elif kind == _STALL:
+        print_stalls(title, report)
+    else:
+        print_errors(title, report)
 
 
 def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: bool) -> None:
@@ -256,10 +270,7 @@ def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: b
         return
     for kind, report in reports.items():
         title = f"{kind.replace('_', '-')}, held-out parts of {data} and those beside it"
-        if kind in _PILE_STATE:
-            print_pile_state(title, [("ours", report)])
-        else:
-            print_errors(title, report)
+        _print_report(kind, title, report)
     print(f"collecting and training {work.text()}")
     for trained, words in (
         (True, "written"),
@@ -320,6 +331,8 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
         ways = {"edges blended": found["errors"], "as predicted": without}
         rows = {"ours": found["errors"]} if without is None else ways
         print_pile_state(title, list(rows.items()))
+    elif description["kind"] == _STALL:
+        print_stalls(title, found["errors"])
     else:
         print_errors(title, found["errors"], found["paper"]["mean_relative"])
-    print_times(found["inference"], found["paper"]["inference_s"])
+    print_times(found["inference"], found["paper"].get("inference_s"))

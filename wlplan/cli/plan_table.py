@@ -43,6 +43,9 @@ def print_plan(document: Mapping[str, Any]) -> None:
         if predicted:
             table.add_column(f"{title}\npred.\n[{unit}]", justify="right", style="cyan")
         table.add_column(f"{title}\nsim.\n[{unit}]", justify="right", style="yellow")
+    foreseen = all("stall_probability" in load for load in document["loads"])
+    if foreseen:
+        table.add_column("stall\npred.\n[%]", justify="right", style="cyan")
     table.add_column("trans-\nport\n[s]", justify="right")
 
     def cells(record: Mapping[str, Any], transport: Mapping[str, float]) -> list[str]:
@@ -50,6 +53,9 @@ def print_plan(document: Mapping[str, Any]) -> None:
         for q, (_, _, digits) in QUANTITIES.items():
             for part in ("predicted", "simulated") if predicted else ("simulated",):
                 row.append(f"{record[part][q]:.{digits}f}")
+        if foreseen:
+            likely = record.get("stall_probability")
+            row.append("" if likely is None else f"{100.0 * likely:.0f}")
         return [*row, f"{transport['time']:.1f}"]
 
     for n, load in enumerate(document["loads"], start=1):

@@ -149,6 +149,7 @@ def plan(
         site=place,
         predicted=planned.rollout.performance,
         predicted_cost=float(planned.cost),
+        stall_probability=planned.stall_probability,
         amount=wanted,
         stopped=planned.stopped,
         seen=getattr(world, "faces_seen", None),
@@ -301,6 +302,7 @@ def simulate(
         site=place,
         predicted=predicted,
         predicted_cost=None if predicted is None else _predicted_cost(given),
+        stall_probability=_stalls_foreseen(given),
         amount=amount,
         pile=named.fields,
         **site.fields(),
@@ -374,6 +376,15 @@ def _predicted_of(document: Mapping[str, Any]) -> Performance | None:
             return None
         rows.append(values)
     return Performance(*np.array(rows, dtype=float).T)
+
+
+def _stalls_foreseen(document: Mapping[str, Any]) -> list[float] | None:
+    """How likely the loads of a plan were said to stall; None unless it says so of all."""
+    likely = [load.get("stall_probability") for load in document["loads"]]
+    known = all(
+        isinstance(v, int | float) and not isinstance(v, bool) and 0.0 <= v <= 1.0 for v in likely
+    )
+    return [float(v) for v in likely] if known else None
 
 
 def _predicted_cost(document: Mapping[str, Any]) -> float | None:

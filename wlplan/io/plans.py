@@ -31,6 +31,7 @@ def plan_to_dict(
     *,
     predicted: Performance | None = None,
     simulated: Performance | None = None,
+    stall_probability: Sequence[float] | None = None,
     transport: Mapping[str, Any] | None = None,
     paths: Sequence[Mapping[str, Any]] | None = None,
     **rest: Any,
@@ -41,6 +42,7 @@ def plan_to_dict(
         plan: The loadings, leaves [N].
         predicted: Performance by the world that planned, leaves [N], tonne, s, kJ.
         simulated: Performance in the simulator, likewise.
+        stall_probability: How likely each load stalls by the world that planned [1].
         transport: Arrays [N] by name, "time" [s] and "work" [kJ], of driving to the truck and back.
         paths: What else is said of each load: its path and its clearance.
         **rest: Further top-level fields: pile, world, objective, seed, total, ledger.
@@ -58,6 +60,8 @@ def plan_to_dict(
         for part, columns in extra.items():
             if columns:
                 load[part] = {name: values[n] for name, values in columns.items()}
+        if stall_probability is not None:
+            load["stall_probability"] = float(stall_probability[n])
         load |= {} if paths is None else paths[n]
         loads.append(load)
     return {"format": PLAN_FORMAT, **rest, "loads": loads}

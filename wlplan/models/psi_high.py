@@ -13,53 +13,24 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from wlplan.constants import CELL_SIZE
 from wlplan.errors import InputError
 from wlplan.models.architecture import ENCODERS
+from wlplan.models.components import PrincipalComponents, normalised_view
 from wlplan.models.grid import check_performance_map
 from wlplan.models.layers import (
     StandardisedMlp,
     activation_named,
     max_pool,
     patches,
-    principal_components,
     resize,
-    soft_clamp,
 )
 from wlplan.models.normaliser import Normaliser
-from wlplan.models.performance import INPUTS, OUTPUTS, PerformanceModel
-from wlplan.terrain.characteristics import as_vector, characteristics
-from wlplan.terrain.heightmap import PERFORMANCE_CELLS, PERFORMANCE_DISPLACEMENT
+from wlplan.models.performance import OUTPUTS, PerformanceModel
 from wlplan.types import LocalHeightmap
 
 # Paper, section 4.4: the map is brought to 32 × 32 cells; three convolutions of ten filters, each
 # with a 2 × 2 pooling; a code of 32 numbers.
 _CELLS, _FILTERS, _STAGES, _CODE = 32, 10, 3, 32
-# Principal components that are kept. Our choice, by trial on held-out cycles.
-_COMPONENTS = 24
-# Least spread of a component: its root mean square over the map, in units of the range of heights.
-# A component that hardly varies stays small; blown up it would only be learnt by heart.
-_LEAST_SPREAD = 0.02
-
-
-class PrincipalComponents(nnx.Module):
-    """What maps have in common: their components of most variance, not trained.
-
-    Of a map and its mirror image the components are either the same or opposite.
-    """
-
-    def __init__(self) -> None:
-        self.basis = nnx.BatchStat(jnp.zeros((PERFORMANCE_CELLS**2, _COMPONENTS)))
-
-    def fit(self, maps: Float[Array, "n 36 36"]) -> None:
-        """Takes the components from the maps of the training data and their mirror images."""
-        rows = jnp.concatenate([maps, maps[:, :, ::-1]]).reshape(-1, PERFORMANCE_CELLS**2)
-        centred = rows - jnp.broadcast_to(rows.mean(axis=0), rows.shape)
-        self.basis[...] = principal_components(centred, _COMPONENTS)
-
-    def __call__(self, maps: Float[Array, "*batch 36 36"]) -> Float[Array, "*batch k"]:
-        """The components of maps, each by its root mean square over the map."""
-        return maps.reshape(*maps.shape[:-2], -1) @ self.basis[...] / PERFORMANCE_CELLS
 
 
 class ConvolutionalEncoder(nnx.Module):
@@ -125,7 +96,7 @@ class PsiHigh(nnx.Module):
             if convolutional
             else PrincipalComponents()
         )
-        inputs = _CODE + 4 if convolutional else _COMPONENTS + INPUTS
+        inputs = _CODE + 4 if convolutional else PrincipalComponents.size
         self.head = StandardisedMlp(
             inputs,
             OUTPUTS,
@@ -160,7 +131,7 @@ class PsiHigh(nnx.Module):
         if isinstance(self.encoder, ConvolutionalEncoder):
             code = self.encoder(maps, training=training)
             return jnp.concatenate([code, inputs[..., 4:]], axis=-1)
-        return jnp.concatenate([self.encoder(maps), inputs], axis=-1)
+        return self.encoder.features(maps, inputs)
 
     def fit_scales(
         self,
@@ -175,8 +146,7 @@ class PsiHigh(nnx.Module):
         self.head.scale_out.fit(outputs)
         if isinstance(self.encoder, PrincipalComponents):
             self.encoder.fit(maps)
-            least = jnp.where(jnp.arange(_COMPONENTS + INPUTS) < _COMPONENTS, _LEAST_SPREAD, 1e-3)
-            self.head.scale_in.fit(self.features(maps, inputs), least=least)
+            self.encoder.fit_scale(self.head.scale_in, maps, inputs)
 
 
 @no_type_check
@@ -200,11 +170,6 @@ class HighPerformanceModel(PerformanceModel):
         self, view: Float[Array, "36 36"], action: Float[Array, "4"]
     ) -> tuple[StandardisedMlp, Float[Array, " k"]]:
         """The perceptron behind the encoder, and what the encoder passes on to it."""
-        local = LocalHeightmap(view, CELL_SIZE, PERFORMANCE_DISPLACEMENT)
-        raw = jnp.concatenate([as_vector(characteristics(local)), jnp.asarray(action)])
         network = nnx.merge(self.graph, self.params)
-        features = network.features(
-            soft_clamp((view - self.maps.low[0]) / self.maps.span[0]),
-            soft_clamp(self.inputs.normalise(raw)),
-        )
-        return network.head, features
+        seen = normalised_view(view, action, self.maps, self.inputs)
+        return network.head, network.features(*seen)

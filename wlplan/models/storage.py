@@ -31,10 +31,11 @@ from wlplan.models.phi import HeightChange, HeightChangeModel
 from wlplan.models.phi_vae import PhiVae, VaePileStateModel
 from wlplan.models.psi_high import HighPerformanceModel, PsiHigh
 from wlplan.models.psi_low import LowPerformanceModel, PsiLow
+from wlplan.models.stall import StallModel, StallNetwork
 
 MODEL_FORMAT = "wlplan.model/1"
 
-Model = PerformanceModel | HeightChangeModel | VaePileStateModel | Ensemble
+Model = PerformanceModel | HeightChangeModel | VaePileStateModel | StallModel | Ensemble
 
 _DESCRIPTION, _WEIGHTS = "model.json", "weights"
 
@@ -63,6 +64,9 @@ _KINDS = {
     ),
     "phi": _Kind(HeightChangeModel, HeightChange, lambda network: network.weights, {}),
     "phi_vae": _Kind(VaePileStateModel, PhiVae, lambda network: network.step, {}),
+    "stall": _Kind(
+        StallModel, StallNetwork, lambda network: network.head, {"maps": 1, "inputs": INPUTS}
+    ),
 }
 
 
@@ -153,7 +157,7 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
 
     Args:
         directory: Where `save_model` wrote it.
-        kind: "psi_low", "psi_high", "phi" (ours) or "phi_vae" (as in the paper).
+        kind: "psi_low", "psi_high", "phi" (ours), "phi_vae" (as in the paper) or "stall".
 
     Returns:
         The model; an `Ensemble` if there are several of it.

@@ -24,7 +24,7 @@ from wlplan.site.receiver import receiver_count
 from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour, toe_contour
 from wlplan.types import Action, LoadingPlan, Pile, Pose, World
-from wlplan.worlds.capabilities import as_pytree, is_differentiable
+from wlplan.worlds.capabilities import FORESIGHT, as_pytree, can, is_differentiable
 
 # As many loads as a plan has rows.
 _AS_GIVEN = Loads(2**30)
@@ -175,6 +175,20 @@ def check_has_gradient(job: Job, remedy: str) -> None:
         said = _passes_reverse_mode(job)
     if not said:
         raise InputError(f"this world has no derivative: {remedy}.")
+
+
+def check_knows_enough(job: Job) -> None:
+    """Refuses to plan for what the world does not know; to play a plan it need not.
+
+    Raises:
+        InputError: If a term of the objective needs it.
+    """
+    for name, need in job.objective.needs.items():
+        if not can(job.world, need):
+            raise InputError(
+                f"the term {name!r} needs a world that knows {FORESIGHT[need]}: plan in a learned "
+                f"world that does, or leave the term out."
+            )
 
 
 def can_refine(job: Job, steps: int) -> bool:

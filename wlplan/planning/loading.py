@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import no_type_check
+from typing import Any, no_type_check
 
 from flax import struct
 from jaxtyping import Array, Float
@@ -33,3 +33,5 @@ class Loading(struct.PyTreeNode):
     performance: Performance
     transport: Transport
     site: Site
+    # The world that foresees or played it; what it can do: `wlplan.worlds.capabilities`.
+    world: Any = None

@@ -58,6 +58,15 @@ class Objective:
         """Names of the terms that are constraints."""
         return tuple(name for name, _, term in self._terms if isinstance(term, Constraint))
 
+    @property
+    def needs(self) -> dict[str, str]:
+        """What the world has to know for each term that needs more of it than the outcome.
+
+        Names of terms -> names in `wlplan.worlds.capabilities.FORESIGHT`.
+        """
+        asked = ((name, getattr(_function(term), "needs", None)) for name, _, term in self._terms)
+        return {name: need for name, need in asked if need is not None}
+
     def values(self, loading: Loading) -> dict[str, Float[Array, ""]]:
         """Each term of a loading without its weight; of a constraint the violation, never < 0.
 

@@ -13,11 +13,21 @@ from wlplan.checks import check_plan
 from wlplan.errors import InputError
 from wlplan.planning import planners
 from wlplan.planning.amounts import Amount, Loads, Made, Tonnes, Trucks, typical_load
-from wlplan.planning.job import Decisions, Job, Standing, beginning, make_job, with_toe
+from wlplan.planning.job import (
+    Decisions,
+    Job,
+    Standing,
+    beginning,
+    check_knows_enough,
+    make_job,
+    with_toe,
+)
 from wlplan.planning.joint import at_receiver
 from wlplan.planning.load_search import price_of
+from wlplan.planning.mending import mended
 from wlplan.planning.objective import Objective
 from wlplan.planning.playing import (
+    OF_LOADS,
     PlanResult,
     assemble,
     assess,
@@ -50,6 +60,7 @@ def plan_loads(
     truck: str | TruckSearch | None = None,
     seed: int = 0,
     referee: World | None = None,
+    mend: bool = True,
     progress: Progress | None = None,
     budget: int | None = None,
     contour: ToeContour | None = None,
@@ -76,6 +87,9 @@ def plan_loads(
             referee has it by then, and picks the cheapest; the poses of the result are the ones
             it dug at. A candidate that costs more in `world` than the planner's limit, for the
             gradient planner the greedy plan, is out. None: `world` picks, with its own poses.
+        mend: Whether loads that fail in the referee, though nothing of it was foreseen, are tried
+            there with the actions of others, see `wlplan.planning.mending`; the limit does not
+            hold for that.
         progress: Called as the planner advances.
         budget: Most that a search may spend, in loadings, see `wlplan.planning.watch.EFFORTS`.
         contour: The toe to dig along; default: that of the pile.
@@ -98,6 +112,7 @@ def plan_loads(
     site = Site() if site is None else site
     amount = amount.of(pile, site.soil)
     job = make_job(world, pile, site=site, objective=objective, amount=amount, contour=contour)
+    check_knows_enough(job)
     checked = None
     if referee is not None:
         checked = make_job(referee, pile, site=job.site, contour=contour).world
@@ -138,7 +153,8 @@ def plan_loads(
             proposals = Proposals(watch.best.plan)
         if proposals is None:
             break
-        result = choose(of_part, _with(proposals, found and found.plan), referee=checked)
+        proposals = _with(proposals, found and found.plan)
+        result = choose(of_part, proposals, referee=checked, mend=mend)
         if not len(result.costs):
             break
         parts.append(result)
@@ -211,13 +227,16 @@ def planner_of(planner: str | Planner, world: World) -> Planner:
     return planner
 
 
-def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> PlanResult:
+def choose(
+    job: Job, proposals: Proposals, *, referee: World | None = None, mend: bool = True
+) -> PlanResult:
     """The cheapest of a planner's candidates that costs no more than its limit.
 
     Args:
         job: What was planned for, in the world that planned.
         proposals: What the planner handed over.
         referee: Who picks; None: the job's own world.
+        mend: Whether loads that fail in the referee are mended, see `plan_loads`.
 
     Raises:
         InputError: If no plan has a finite cost.
@@ -229,7 +248,8 @@ def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> P
         if rows.truck is None and not isinstance(job.amount, Loads):
             # The referee is to fill the trucks that were planned for.
             rows = rows.replace(truck=outcomes(job, rows).plan.truck)
-        judged = outcomes(job.replace(world=as_pytree(referee)), rows)
+        refereed = job.replace(world=as_pytree(referee))
+        judged = outcomes(refereed, rows)
         # The toe is where the referee's pile begins, so the poses are the ones it was played with.
         seen = outcomes(job, judged.plan)
     costs = np.asarray(seen.cost)
@@ -241,10 +261,16 @@ def choose(job: Job, proposals: Proposals, *, referee: World | None = None) -> P
             "no plan has a finite cost: check the pile for spikes, and the terms of the objective."
         )
     winner = int(np.argmin(np.where(allowed, np.asarray(judged.cost), np.inf)))
-    result = _made(job, _member(seen, winner))
+    best = _member(seen, winner)
     if referee is None:
-        return result
-    return result.replace(refereed=_made(job, _member(judged, winner)))
+        return _made(job, best)
+    played = _member(judged, winner)
+    better = mended(refereed, _member(rows, winner), best, played) if mend else None
+    if better is not None:
+        again = _member(outcomes(job, jax.tree.map(lambda leaf: leaf[None], better.plan)), 0)
+        if np.isfinite(float(again.cost)):
+            best, played = again, better
+    return _made(job, best).replace(refereed=_made(job, played))
 
 
 def _made(job: Job, result: PlanResult) -> PlanResult:
@@ -255,7 +281,7 @@ def _made(job: Job, result: PlanResult) -> PlanResult:
     rows = np.flatnonzero(np.asarray(truck) >= 0)
     of_loads = {
         name: jax.tree.map(lambda leaf: leaf[rows], getattr(result, name))
-        for name in ("plan", "transport", "terms", "misfit", "costs", "faces", "ways", "solves")
+        for name in ("plan", *OF_LOADS)
     }
     performance = jax.tree.map(lambda leaf: leaf[rows], result.rollout.performance)
     made = result.replace(rollout=result.rollout.replace(performance=performance), **of_loads)
@@ -348,6 +374,5 @@ def _play_load_by_load(
     return assemble(job, jax.tree.map(lambda *leaves: jnp.stack(leaves), *loadings), standing)
 
 
-def _member(batch: PlanResult, k: int) -> PlanResult:
-    member: PlanResult = jax.tree.map(lambda leaf: leaf[k], batch)
-    return member
+def _member(batch: Any, k: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[k], batch)

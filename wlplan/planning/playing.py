@@ -24,6 +24,7 @@ from wlplan.site.receiver import Receiver
 from wlplan.terrain.characteristics import characteristics
 from wlplan.terrain.heightmap import sample_local
 from wlplan.types import Characteristics, LoadingPlan, Performance, Rollout, SolveReport
+from wlplan.worlds.capabilities import can
 from wlplan.xla import ParallelMap
 
 
@@ -66,6 +67,8 @@ class PlanResult(struct.PyTreeNode):
     faces: Characteristics | None = None  # dug, leaves (N,); None: nobody asked for them
     ways: Ways | None = None  # leaves (N, ...); None: nobody asked for them
     solves: SolveReport | None = None  # leaves (N,); None: the world does not say
+    # How likely each load stalls, as foreseen [1]; None: the world does not say.
+    stall_probability: Float[Array, " n"] | None = None
     refereed: PlanResult | None = None  # the same plan played by the referee, if there was one
     # Where the loader dumps, leaves (K,) if each truck has its own place; None: as the site has it.
     receiver: Receiver | None = None
@@ -73,6 +76,19 @@ class PlanResult(struct.PyTreeNode):
     # "", "budget" or "interrupted".
     spent: float = struct.field(pytree_node=False, default=0.0)
     stopped: str = struct.field(pytree_node=False, default="")
+
+
+OF_LOADS = (
+    "transport",
+    "terms",
+    "misfit",
+    "costs",
+    "faces",
+    "ways",
+    "solves",
+    "stall_probability",
+)
+"""Fields of a result, beside plan and performance, whose leaves have an axis of loads."""
 
 
 def assess(
@@ -101,7 +117,7 @@ def assess(
     carried, way = transport(pile, one.pose, mass, site, room, cusps=cusps, thorough=thorough)
     step = job.amount.step(standing.done, mass, leaves)
     carried = carried.replace(wait=step.wait)
-    loading = Loading(pile, one.pose, one.action, performance, carried, site)
+    loading = Loading(pile, one.pose, one.action, performance, carried, site, job.world)
     terms = job.objective.values(loading)
     ways = Ways(
         way, unseen_along(way, job.yard, job.site.machine.turning_radius), packed_soil(pile)
@@ -116,7 +132,11 @@ def assess(
 
 
 def assemble(
-    job: Job, loadings: Assessed, last: Standing, solves: SolveReport | None = None
+    job: Job,
+    loadings: Assessed,
+    last: Standing,
+    solves: SolveReport | None = None,
+    stall_probability: Array | None = None,
 ) -> PlanResult:
     """Loadings in order, leaves with leading axis N, and where the last leaves the job."""
     missing = job.amount.missing(last.done)
@@ -132,6 +152,7 @@ def assemble(
         faces=loadings.face,
         ways=loadings.ways,
         solves=solves,
+        stall_probability=stall_probability,
     )
 
 
@@ -149,10 +170,12 @@ def play_candidate(
         candidate: Decisions, each taken on the pile that the ones before left, or fixed poses. If
             it says nothing of trucks, loads are made until the amount is done.
         cusps: Of the best ways to the receiver where they are known, see `cusps_of_plans`.
-        report: Whether to look at how the world's solvers ended, where it says so.
+        report: Whether to look at how the world's solvers ended and how likely loads stall, where
+            it says so.
     """
     solve = getattr(job.world, "solve", None) if report else None
     play: Callable[..., Any] = job.world if solve is None else solve
+    foresees: Any = job.world if report and can(job.world, "stall_probability") else None
 
     def load(standing: Standing, inputs: Any) -> tuple[Standing, Any]:
         one, leaves, known = inputs
@@ -163,11 +186,17 @@ def play_candidate(
                 height=jnp.where(one.truck >= 0, after.height, standing.pile.height)
             )
         assessed, done = assess(job, standing, one, performance, leaves=leaves, cusps=known)
-        return Standing(after, done), (assessed, solved[0] if solved else None)
+        likely = (
+            None
+            if foresees is None
+            else foresees.stall_probability(standing.pile, one.pose, one.action)
+        )
+        return Standing(after, done), (assessed, solved[0] if solved else None, likely)
 
     leaves = None if candidate.truck is None else leaves_after(candidate.truck)
-    last, (loadings, solves) = load_by_load(load, beginning(job), (candidate, leaves, cusps))
-    return assemble(job, loadings, last, solves)
+    last, found = load_by_load(load, beginning(job), (candidate, leaves, cusps))
+    loadings, solves, likely = found
+    return assemble(job, loadings, last, solves, likely)
 
 
 def leaves_after(truck: Int[Array, " n"]) -> Bool[Array, " n"]:
@@ -229,9 +258,8 @@ def joined(parts: Sequence[PlanResult]) -> PlanResult:
     def together(*leaves: Any) -> Array:
         return jnp.concatenate([jnp.atleast_1d(leaf) for leaf in leaves])
 
-    names = ("transport", "terms", "misfit", "costs", "faces", "ways", "solves")
     of_loads = {
-        name: jax.tree.map(together, *(getattr(part, name) for part in parts)) for name in names
+        name: jax.tree.map(together, *(getattr(part, name) for part in parts)) for name in OF_LOADS
     }
     performance = jax.tree.map(together, *(part.rollout.performance for part in parts))
     seen = [part.refereed for part in parts if part.refereed is not None]

@@ -17,7 +17,15 @@ from jaxtyping import Array, Float
 
 from wlplan.errors import InputError
 from wlplan.planning.amounts import Amount, Done, Loads, Trucks, nothing_done
-from wlplan.planning.job import Decisions, Job, Standing, decided, make_job, with_toe
+from wlplan.planning.job import (
+    Decisions,
+    Job,
+    Standing,
+    check_knows_enough,
+    decided,
+    make_job,
+    with_toe,
+)
 from wlplan.planning.load_search import LoadSearch, Memory
 from wlplan.planning.loading import Transport
 from wlplan.planning.objective import Objective
@@ -118,6 +126,7 @@ class Replanner:
             objective=self._objective,
             amount=self._amount,
         )
+        check_knows_enough(job)
         self._site = self._site.replace(receiver=job.site.receiver)
         job = with_toe(job)
         done = nothing_done(pile.height.dtype) if self._done is None else self._done

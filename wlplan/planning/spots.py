@@ -127,7 +127,7 @@ def _yields_of(
         _, performance = job.world(job.pile, dig, action)
         ways = Transport(time, work), Transport(time + more, work)
         near, far = (
-            job.objective(Loading(job.pile, dig, action, performance, way, job.site))
+            job.objective(Loading(job.pile, dig, action, performance, way, job.site, job.world))
             for way in ways
         )
         return near, far, performance.mass

@@ -1,8 +1,9 @@
 """Terms of an objective: functions of one loading to one number, the smaller the better.
 
 The three of the follow-up are here, and room to drive; `wlplan.planning.face` has those of a face
-that is worked well. References make them comparable: the means of the follow-up's
-greedy plan, 64.4 t, 694 s and 15.5 MJ over 15 loads.
+that is worked well, `wlplan.planning.risk` those of what may come out worse than foreseen.
+References make them comparable: the means of the follow-up's greedy plan, 64.4 t, 694 s and 15.5 MJ
+over 15 loads.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float
 
 from wlplan.planning.face import oblique, slot, undercut
 from wlplan.planning.loading import Loading
+from wlplan.planning.risk import Deviation, ExpectedStall
 
 Term = Callable[[Loading], Float[Array, ""]]
 """`term(loading)`: a scalar; any function of a loading is one."""
@@ -72,5 +74,7 @@ TERMS: dict[str, Term] = {
     "slot": slot,
     "oblique": oblique,
     "undercut": undercut,
+    "stall": ExpectedStall(),
+    "deviation": Deviation(),
 }
 """Terms by name."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from wlplan.constants import KG_PER_TONNE, QUANTITIES
 from wlplan.io.plans import plan_to_dict
@@ -42,6 +43,7 @@ def plan_document(
     site: Site,
     predicted: Performance | None = None,
     predicted_cost: float | None = None,
+    stall_probability: Sequence[float] | Array | None = None,
     amount: Amount | None = None,
     stopped: str = "",
     seen: tuple[Characteristics, Characteristics] | None = None,
@@ -55,6 +57,7 @@ def plan_document(
         site: Where: its receiver, its frame, and its soil, whose density closes the ledger.
         predicted: What the world that planned foresaw, leaves [N]; None: nothing is known of it.
         predicted_cost: Cost of the plan in that world.
+        stall_probability: How likely each load stalls by that world [1]; None: it does not know.
         amount: How much was to be loaded.
         stopped: What ended the search for the plan early, see `PlanResult`.
         seen: The least and the largest characteristics of faces that it was trained on.
@@ -85,6 +88,9 @@ def plan_document(
         **ways,
         predicted=predicted,
         simulated=simulated.rollout.performance,
+        stall_probability=None
+        if stall_probability is None
+        else np.asarray(stall_probability, np.float64).tolist(),
         transport={"time": simulated.transport.time, "work": simulated.transport.work},
         **origin,
         **job,

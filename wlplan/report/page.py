@@ -102,6 +102,7 @@ def _template() -> Template:
         "number": _number,
         "percent": _percent,
         "plain": _plain,
+        "share": _share,
     }
     source = resources.files("wlplan.report").joinpath("page.html.j2")
     return environment.from_string(source.read_text(encoding="utf-8"))
@@ -141,6 +142,12 @@ def _difference(predicted: object, simulated: object) -> str:
 def _percent(part: object) -> str:
     number = _finite(part)
     return _DASH if number is None else f"{100.0 * number:.2g} %"
+
+
+def _share(part: object) -> str:
+    """A probability in whole percent; a dash where there is none."""
+    number = _finite(part)
+    return _DASH if number is None else f"{100.0 * number:.0f}{_NO_BREAK}%"
 
 
 def _plain(value: object) -> str:

@@ -19,6 +19,8 @@ from wlplan.types import Characteristics, Pile
 _NEXT_TO_NOTHING = 0.3
 # How far a prediction of a load may be off what was played, relative.
 _FAR_OFF = 0.25
+# Probability of a stall that is worth saying: some six times that of a cycle with any action.
+_MAY_STALL = 0.15
 # How far a characteristic of a face may be outside what a model was trained on, as a part of that.
 _OUTSIDE = 0.1
 # Part of a truck, and of all ways, on unseen ground that is worth saying.
@@ -54,6 +56,7 @@ def remarks_on(
         *_trucks(document),
         *_empty(loads),
         *_far_off(loads),
+        *_may_stall(loads),
         *_new_faces(faces, seen),
         *_tight(loads),
         *_unseen_ways(loads),
@@ -110,6 +113,17 @@ def _far_off(loads: Sequence[Mapping[str, Any]]) -> list[str]:
     return [
         f"{_loads(far, 'is', 'are')} predicted up to {100.0 * worst.max():.0f} % off what was "
         f"played: go by what was played"
+    ]
+
+
+def _may_stall(loads: Sequence[Mapping[str, Any]]) -> list[str]:
+    likely = np.array([load.get("stall_probability", 0.0) for load in loads])
+    edge = np.flatnonzero(likely > _MAY_STALL)
+    if not len(edge):
+        return []
+    return [
+        f"{_loads(edge, 'is', 'are')} at the edge of a stall, with a probability of up to "
+        f"{100.0 * likely.max():.0f} %: a stall takes more than twice as long"
     ]
 
 

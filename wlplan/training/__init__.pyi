@@ -14,5 +14,8 @@ from .settings import PhiVaeSettings as PhiVaeSettings
 from .settings import PsiHighSettings as PsiHighSettings
 from .settings import PsiLowSettings as PsiLowSettings
 from .settings import Settings as Settings
+from .settings import StallSettings as StallSettings
+from .stall import StallReport as StallReport
+from .stall import evaluate_stalls as evaluate_stalls
 from .trainer import train as train
 from .weights import train_all as train_all

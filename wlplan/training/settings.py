@@ -197,7 +197,19 @@ class PhiVaeSettings(Settings):
     learning_rate: float = _learning_rate(1e-3)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StallSettings(Settings):
+    """How the predictor of stalls is trained."""
+
+    kind: ClassVar[str] = "stall"
+
+    epochs: int = _epochs(30)
+    hidden: tuple[int, ...] = _hidden((128, 128, 128))
+    activation: str = _activation()
+
+
 KINDS: dict[str, type[Settings]] = {
-    each.kind: each for each in (PsiLowSettings, PsiHighSettings, PhiSettings, PhiVaeSettings)
+    each.kind: each
+    for each in (PsiLowSettings, PsiHighSettings, PhiSettings, PhiVaeSettings, StallSettings)
 }
 """The settings of each kind of model that can be trained."""

@@ -13,7 +13,13 @@ from wlplan.dataset.store import is_new, read_attributes
 from wlplan.errors import InputError
 from wlplan.io.provenance import versions
 from wlplan.models.storage import load_model, read_description
-from wlplan.training.settings import PhiSettings, PsiHighSettings, PsiLowSettings, Settings
+from wlplan.training.settings import (
+    PhiSettings,
+    PsiHighSettings,
+    PsiLowSettings,
+    Settings,
+    StallSettings,
+)
 from wlplan.training.trainer import train
 
 
@@ -42,6 +48,7 @@ SHIPPED: tuple[Settings, ...] = (
     PsiLowSettings(members=5, hidden=(128,) * 3, dropout=0.0, epochs=40, batch=256),
     PsiHighSettings(members=5, hidden=(256,) * 3, dropout=0.0, epochs=60, batch=256),
     PhiSettings(hidden=(512,) * 3, dropout=0.0, epochs=40, batch=256),
+    StallSettings(hidden=(128,) * 3, dropout=0.0, epochs=24, batch=256),
 )
 """How the models that ship are trained, apart from the seed."""
 
@@ -61,7 +68,7 @@ def train_all(
     Args:
         data: Data set of the paper's protocol; the others lie beside it, with something added to
             the name. Each is collected if there is none or a part of it.
-        out: Directory of the models, each in one of its own: `psi_low`, `psi_high`, `phi`.
+        out: Directory of the models, each in one of its own: `psi_low`, `psi_high`, `phi`, `stall`.
         seed: Seed of collection and training.
         epochs: Passes over the data for every model; None: of each its own.
         progress: Called with what is done, how far it is, and how far it goes; of a training with

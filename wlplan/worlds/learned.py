@@ -7,6 +7,7 @@ from typing import Any, no_type_check
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float
 
 from wlplan.constants import KG_PER_TONNE
 from wlplan.errors import InputError
@@ -54,6 +55,7 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
     settle: bool = struct.field(pytree_node=False, default=True)
+    stall: Any = None  # stall(local, action) -> probability; None: it does not foresee stalls
 
     differentiable = True
 
@@ -102,6 +104,25 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
         deviation: Performance = _deviation(self, pile, pose, action)
         return deviation
 
+    @property
+    def has_stall_probability(self) -> bool:
+        """Whether it has a predictor of stalls."""
+        return self.stall is not None
+
+    def stall_probability(self, pile: Pile, pose: Pose, action: Action) -> Float[Array, ""]:
+        """Probability that a loading on the pile as given stalls [1]. Differentiable.
+
+        Raises:
+            InputError: If it has no predictor of stalls.
+        """
+        if not self.has_stall_probability:
+            raise InputError(
+                "this world has no predictor of stalls: train one with `wlplan train stall`, and "
+                "give it to LearnedWorld(..., stall=...) or load_world(..., stall=...)."
+            )
+        probability: Array = _stall_probability(self.stall, pile, pose, action)
+        return probability
+
 
 @jax.jit
 def _solve(
@@ -130,3 +151,9 @@ def _deviation(world: LearnedWorld, pile: Pile, pose: Pose, action: Action) -> P
     local, vector = sample_local(pile, pose), action_vector(action)
     deviation: Performance = world.performance.with_deviation(local, vector)[1]
     return deviation
+
+
+@jax.jit
+def _stall_probability(stall: Any, pile: Pile, pose: Pose, action: Action) -> Array:
+    probability: Array = stall(sample_local(pile, pose), action_vector(action))
+    return probability

@@ -13,6 +13,7 @@ class Learned(NamedTuple):
 
     performance: str
     pile_state: str | None = None  # None: the strip in front of the bucket
+    stall: str = "stall"  # what foresees stalls
 
 
 WORLDS: dict[str, Learned | str] = {

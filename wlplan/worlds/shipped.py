@@ -28,6 +28,7 @@ def load_world(
     *,
     model: str | Path | None = None,
     pile_state: str | Path | None = None,
+    stall: str | Path | None = None,
     soil: Soil = GRAVEL,
     machine: WheelLoader = WA320,
 ) -> World:
@@ -40,6 +41,8 @@ def load_world(
         model: Directory of a trained ψ, of either kind, instead of the one that ships.
         pile_state: Directory of a trained φ, of either kind, instead of the one that ships, or of
             the strip and the automaton.
+        stall: Directory of a trained predictor of stalls instead of the one that ships. That is
+            left out where `model` is given: it knows the soil and the machine of its own training.
         soil: What is dug. A learned world takes from it the density, by which it turns mass into
             volume, and the angle of repose; what it predicts is for the soil of its training.
         machine: What digs. A learned world takes from it the width of the bucket.
@@ -54,18 +57,21 @@ def load_world(
         raise InputError(f"unknown world {name!r}: choose one of {', '.join(WORLDS)}.")
     recipe = WORLDS[name]
     if isinstance(recipe, str):
-        if model is not None or pile_state is not None:
+        if any(given is not None for given in (model, pile_state, stall)):
             raise InputError(f"the world {name!r} has no models: leave them out.")
         engine: World = load_object(recipe)(machine=machine, soil=soil)
         return engine
     psi = _model(recipe.performance if model is None else Path(model), _PERFORMANCE)
     place = recipe.pile_state if pile_state is None else Path(pile_state)
     phi: Any = Strip() if place is None else _model(place, _PILE_STATE)
-    return LearnedWorld(psi, phi, machine=machine, soil=soil)
+    risk = None
+    if stall is not None or model is None:
+        risk = _model(recipe.stall if stall is None else Path(stall), _STALL)
+    return LearnedWorld(psi, phi, machine=machine, soil=soil, stall=risk)
 
 
-# Kinds of models in either place of a learned world, and what makes them.
-_PERFORMANCE, _PILE_STATE = ("psi_low", "psi_high"), ("phi", "phi_vae")
+# Kinds of models in each place of a learned world, and what makes them.
+_PERFORMANCE, _PILE_STATE, _STALL = ("psi_low", "psi_high"), ("phi", "phi_vae"), ("stall",)
 
 
 def _model(place: str | Path, kinds: tuple[str, ...]) -> Any:

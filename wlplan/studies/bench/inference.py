@@ -15,6 +15,7 @@ from wlplan.dataset import Dataset
 from wlplan.models.ensemble import Ensemble
 from wlplan.models.performance import PerformanceModel
 from wlplan.models.pile_state import PileStatePredictor
+from wlplan.models.stall import StallModel
 from wlplan.site.soil import GRAVEL
 from wlplan.studies.bench.timing import Timing, compiled, timed
 from wlplan.terrain.heightmap import STATE_DISPLACEMENT
@@ -50,14 +51,16 @@ class InferenceTime:
         }
 
 
-def performance_times(model: PerformanceModel | Ensemble, dataset: Dataset) -> list[InferenceTime]:
+def performance_times(
+    model: PerformanceModel | Ensemble | StallModel, dataset: Dataset
+) -> list[InferenceTime]:
     """Times ψ on one input, and on 150 in one call; an ensemble also with its deviation.
 
     An input is what a data set stores of the local heightmap, see `PerformanceModel.view`. The
     weights are compiled in, as in a planner: to hand them over takes a small model as long again.
 
     Args:
-        model: Performance predictor.
+        model: Performance predictor, or the predictor of stalls.
         dataset: Cycles to take the inputs from; where there are fewer than 150, some come again.
     """
     table = (getattr(dataset, model.view_variable), dataset.action)
