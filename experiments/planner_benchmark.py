@@ -13,7 +13,6 @@ import dataclasses
 import itertools
 import json
 import math
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,10 +21,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import t as student
 
 import wlplan
 from experiments._common.budgets import OverBudget, Within
+from experiments._common.comparison import best_plans, by_planner, looking_ahead
 from experiments._common.instances import JOBS, PILES, SITES, SMOKE_JOB, Instance
 from experiments._common.results import PRESETS, RESULTS, write_result
 from wlplan.io import write_bytes_atomic, write_text_atomic
@@ -69,29 +68,39 @@ _PLACES = {
 }
 # A cycle of filling that takes longer than this has stalled [s].
 _STALL = 18.0
-_CONFIDENCE = 0.95
 # So little compiling does not show in the time of a run [s].
 _WARM = 0.5
 
-PLANNERS: dict[str, Callable[[], Planner]] = {
-    "greedy": Greedy,
-    "nominal": Nominal,
-    "max load": MaxLoad,
-    "random search": RandomSearch,
-    "iterated greedy": lambda: IteratedGreedy(rounds=10_000),
-    "gradient": Gradient,
-    "gradient from iterated": lambda: Gradient(start=IteratedGreedy()),
-    "tree 1": lambda: TreeSearch(depth=1),
-    "tree 2": lambda: TreeSearch(depth=2),
-    "tree 3": lambda: TreeSearch(depth=3),
-    "tree 4": lambda: TreeSearch(depth=4),
-    "tree 2, poses refined": lambda: TreeSearch(depth=2, refine_poses=True),
-    "cross-entropy": CrossEntropy,
-    "cma-es": CmaEs,
+
+def _always(planner: Callable[[], Planner]) -> Callable[[int], Planner]:
+    """Whatever the budget is: what a planner does not use up, it gets again with another seed."""
+    return lambda budget: planner()
+
+
+def _iterated(budget: int) -> Planner:
+    """As many rounds as a budget has room for; one makes half a plan and plays it."""
+    starts = 10 if budget > 10 else min(budget, 3)
+    return IteratedGreedy(starts=starts, rounds=int(1.7 * (budget - starts)))
+
+
+PLANNERS: dict[str, Callable[[int], Planner]] = {
+    "greedy": _always(Greedy),
+    "nominal": _always(Nominal),
+    "max load": _always(MaxLoad),
+    "random search": _always(RandomSearch),
+    "iterated greedy": _iterated,
+    "gradient": _always(Gradient),
+    "gradient from iterated": _always(lambda: Gradient(start=IteratedGreedy(rounds=5))),
+    "tree 1": _always(lambda: TreeSearch(depth=1)),
+    "tree 2": _always(lambda: TreeSearch(depth=2)),
+    "tree 3": _always(lambda: TreeSearch(depth=3)),
+    "tree 4": _always(lambda: TreeSearch(depth=4)),
+    "tree 2, poses refined": _always(lambda: TreeSearch(depth=2, refine_poses=True)),
+    "cross-entropy": _always(CrossEntropy),
+    "cma-es": _always(CmaEs),
 }
-"""What is compared, by the name that the tables have. One more is entered by `--planner`."""
-AHEAD = tuple(name for name in PLANNERS if name not in ("greedy", "nominal", "max load"))
-"""Those that look at more than the next load."""
+"""What is compared: planners for a budget, in times what greedy spends, by the name that the tables
+have. One more is entered by `--planner`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,7 +267,7 @@ def _summary(played: wlplan.PlanResult) -> dict[str, float]:
 def work(
     todo: Sequence[Run],
     folder: Path,
-    planners: dict[str, Callable[[], Planner]],
+    planners: dict[str, Callable[[int], Planner]],
     until: float,
 ) -> None:
     """Makes the rows that are not there yet.
@@ -283,7 +292,7 @@ def work(
                 return
             of_greedy = row["spent"] / row["rows"]
         receiver = place_truck(run.instance, run.seed, folder / "places")
-        row = play_run(run, planners[run.planner](), of_greedy, receiver)
+        row = play_run(run, planners[run.planner](run.budget), of_greedy, receiver)
         write_text_atomic(folder / f"{run.name}.json", json.dumps(row) + "\n")
         said = {name: value for name, value in row.items() if name != "plan"}
         print(f"{number + 1}/{len(todo)} {json.dumps(said)}", flush=True)
@@ -313,141 +322,6 @@ def run(preset: str, rows: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
         "planners": by_planner(compared),
         "rows": [{k: v for k, v in row.items() if k != "plan"} for row in compared],
     }
-
-
-Key = tuple[str, str, str, int]
-
-
-def _key(row: dict[str, Any]) -> Key:
-    return row["pile"], row["job"], row["site"], row["seed"]
-
-
-def gains(
-    rows: Sequence[dict[str, Any]], planner: str, budget: int
-) -> list[tuple[Key, dict[str, float]]]:
-    """What a planner is better than greedy by, on the same instance and seed [%].
-
-    Args:
-        rows: All of them.
-        planner: Its name.
-        budget: Its budget; greedy has its own, 1.
-    """
-    base = {_key(row): row for row in rows if (row["planner"], row["budget"]) == ("greedy", 1)}
-    found = []
-    for row in rows:
-        if (row["planner"], row["budget"]) != (planner, budget) or _key(row) not in base:
-            continue
-        greedy = base[_key(row)]
-        found.append(
-            (
-                _key(row),
-                {
-                    "predicted": _less(row["predicted"], greedy["predicted"]),
-                    "cost": _less(row["simulator"]["cost"], greedy["simulator"]["cost"]),
-                    "picked": _less(_picked(row), _picked(greedy)),
-                    "seconds_a_tonne": _less(*(_a_tonne(r, "time") for r in (row, greedy))),
-                    "work_a_tonne": _less(*(_a_tonne(r, "work") for r in (row, greedy))),
-                    "loads": float(row["simulator"]["loads"] - greedy["simulator"]["loads"]),
-                },
-            )
-        )
-    return found
-
-
-def _less(value: float, than: float) -> float:
-    return 100.0 * (than - value) / than
-
-
-def _picked(row: dict[str, Any]) -> float:
-    return float((row["picked"] or row["simulator"])["cost"])
-
-
-def _a_tonne(row: dict[str, Any], name: str) -> float:
-    return float(row["simulator"][name] / row["simulator"]["mass"])
-
-
-def interval(of: Sequence[tuple[Key, dict[str, float]]], name: str) -> dict[str, Any]:
-    """Mean over the piles, each by its mean over the seeds, and its confidence interval.
-
-    Piles are what the benchmark is to speak for; seeds of one pile are not independent of it.
-
-    Args:
-        of: Gains.
-        name: Of the measure.
-    """
-    by_pile: dict[str, list[float]] = {}
-    for (pile, *_), measures in of:
-        by_pile.setdefault(pile, []).append(measures[name])
-    means = [statistics.fmean(values) for values in by_pile.values()]
-    mean, half = statistics.fmean(means), math.nan
-    if len(means) > 1:
-        quantile = float(student.ppf(0.5 + 0.5 * _CONFIDENCE, len(means) - 1))
-        half = quantile * statistics.stdev(means) / math.sqrt(len(means))
-    return {"mean": mean, "half": None if math.isnan(half) else half, "piles": len(means)}
-
-
-def by_planner(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Every planner at every budget beside greedy, job by job and site by site."""
-    table = []
-    seen = dict.fromkeys((row["job"], row["site"], row["planner"], row["budget"]) for row in rows)
-    for job, site, planner, budget in sorted(seen):
-        here = [row for row in rows if (row["job"], row["site"]) == (job, site)]
-        found = gains(here, planner, budget)
-        if not found:
-            continue
-        own = [row for row in here if (row["planner"], row["budget"]) == (planner, budget)]
-        measures = {name: interval(found, name) for name in found[0][1]}
-        of: dict[str, float | None] = {
-            "spent": statistics.median(float(row["spent"]) for row in own)
-        }
-        # Times tell something where nothing was compiled.
-        warm = [row for row in own if not row["compiled"]]
-        for name in ("seconds", "processor"):
-            of[name] = statistics.median(float(r[name]) for r in warm) if warm else None
-        head = {"job": job, "site": site, "planner": planner, "budget": budget}
-        table.append({**head, "pairs": len(found), **of, **measures})
-    return table
-
-
-def looking_ahead(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What the best of the planners that look ahead is better than greedy by, job by job.
-
-    The best is chosen by what it foresees, as a user would, and not by how it was played.
-    """
-    table = []
-    places = dict.fromkeys((row["job"], row["site"], row["budget"]) for row in rows)
-    for job, site, budget in sorted(places):
-        here = [row for row in rows if (row["job"], row["site"]) == (job, site)]
-        found = {planner: gains(here, planner, budget) for planner in AHEAD}
-        found = {planner: one for planner, one in found.items() if one}
-        if not found:
-            continue
-        means = {planner: interval(one, "predicted")["mean"] for planner, one in found.items()}
-        best = max(means, key=lambda planner: means[planner])
-        measures = {name: interval(found[best], name) for name in found[best][0][1]}
-        head = {"job": job, "site": site, "budget": budget, "planner": best}
-        table.append({**head, "pairs": len(found[best]), **measures})
-    return table
-
-
-def best_plans(
-    rows: Sequence[dict[str, Any]], before: Sequence[dict[str, Any]]
-) -> list[dict[str, Any]]:
-    """The plan of each instance that costs least in the simulator, of rows and those known before.
-
-    Args:
-        rows: Of runs, with their plans.
-        before: As this returns them.
-    """
-    best: dict[tuple[str, ...], dict[str, Any]] = {}
-    for row in (*before, *rows):
-        if row["plan"] is None:
-            continue
-        place = row["pile"], row["job"], row["site"]
-        if place not in best or row["simulator"]["cost"] < best[place]["simulator"]["cost"]:
-            kept = ("pile", "job", "site", "planner", "budget", "seed", "simulator", "plan")
-            best[place] = {name: row[name] for name in kept}
-    return [best[place] for place in sorted(best)]
 
 
 def draw(folder: Path) -> None:
@@ -511,7 +385,7 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     rows_in = options.rows or (options.out / ROWS.name if options.preset == "smoke" else ROWS)
     if not options.draw:
-        planners = PLANNERS | {name: load_object(name) for name in options.planner}
+        planners = PLANNERS | {name: _always(load_object(name)) for name in options.planner}
         chosen = tuple(SMOKE if options.preset == "smoke" else planners)
         if not options.join:
             until = time.monotonic() + 60.0 * options.minutes
@@ -534,10 +408,10 @@ def main() -> None:
 
 # Few trials each: whether all goes through, and not what it comes to.
 _FEW = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3)
-SMOKE: dict[str, Callable[[], Planner]] = {
-    "greedy": lambda: _FEW,
-    "tree 1": lambda: TreeSearch(depth=1, actions=6, refine_steps=2, poses_per_metre=0.3),
-    "gradient": lambda: Gradient(iterations=1, starts=2, start=_FEW),
+SMOKE: dict[str, Callable[[int], Planner]] = {
+    "greedy": _always(lambda: _FEW),
+    "tree 1": _always(lambda: TreeSearch(depth=1, actions=6, refine_steps=2, poses_per_metre=0.3)),
+    "gradient": _always(lambda: Gradient(iterations=1, starts=2, start=_FEW)),
 }
 
 if __name__ == "__main__":

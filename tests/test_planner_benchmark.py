@@ -12,6 +12,7 @@ import pytest
 from cones import SITE, circle, cone, spoilt_world
 
 from experiments import planner_benchmark as benchmark
+from experiments._common import comparison
 from experiments._common.budgets import OverBudget, Within
 from experiments._common.instances import Instance
 from wlplan.planning.amounts import Loads
@@ -68,7 +69,7 @@ def test_pairs_are_of_one_instance_and_seed() -> None:
         row("cone", "cma-es", 10, 2, 1.0),
         row("cone", "cma-es", 1, 0, 1.0),
     ]
-    found = benchmark.gains(rows, "cma-es", 10)
+    found = comparison.gains(rows, "cma-es", 10)
     assert [key[-1] for key, _ in found] == [0, 1]
     np.testing.assert_allclose([one["cost"] for _, one in found], [2.0, -2.5])
     np.testing.assert_allclose([one["seconds_a_tonne"] for _, one in found], 0.0)
@@ -82,25 +83,25 @@ def test_an_interval_is_over_piles() -> None:
         (("b", "", "", 0), {"cost": 2.0}),
         (("c", "", "", 0), {"cost": 6.0}),
     ]
-    found = benchmark.interval(of, "cost")
+    found = comparison.interval(of, "cost")
     assert found["piles"] == 3
     assert found["mean"] == pytest.approx(3.0)
     # 4.3027 is the quantile of two degrees of freedom, the deviation of the means is sqrt(7).
     assert found["half"] == pytest.approx(4.3027 * math.sqrt(7.0 / 3.0), rel=1e-4)
-    assert benchmark.interval(of[:2], "cost")["half"] is None
+    assert comparison.interval(of[:2], "cost")["half"] is None
 
 
 def test_the_best_plan_known_is_kept() -> None:
     before = [row("cone", "greedy", 1, 0, 50.0), row("ridge", "greedy", 1, 0, 30.0)]
-    known = benchmark.best_plans(before, [])
-    again = benchmark.best_plans(
+    known = comparison.best_plans(before, [])
+    again = comparison.best_plans(
         [row("cone", "cma-es", 10, 0, 49.0), row("ridge", "cma-es", 10, 0, 31.0)], known
     )
     assert [(one["pile"], one["simulator"]["cost"]) for one in again] == [
         ("cone", 49.0),
         ("ridge", 30.0),
     ]
-    assert benchmark.best_plans([row("cone", "x", 1, 0, 1.0, plan=None)], known) == known
+    assert comparison.best_plans([row("cone", "x", 1, 0, 1.0, plan=None)], known) == known
 
 
 def test_shards_share_the_runs_out() -> None:
