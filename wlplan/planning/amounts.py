@@ -157,9 +157,27 @@ class Loads(Amount):
     count: int | Array
 
     def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
-        """All of them."""
+        """All of them, or of many about a dozen."""
         del typical
-        return None if made.loads else (self, int(self.count))
+        count, left = int(self.count), int(self.count) - made.loads
+        if left <= 0:
+            return None
+        if count <= _ROWS:
+            return self, count
+        rows = math.ceil(count / math.ceil(count / _LOADS_AT_ONCE))
+        return SomeLoads(min(left, rows)), rows
+
+    def is_done(self, done: Done) -> Bool[Array, ""]:
+        """Once all are made."""
+        return done.loads >= self.count
+
+
+@no_type_check
+class SomeLoads(Amount):
+    """A part of many `Loads`: as many rows as every other part, the last of which need not all be
+    made."""
+
+    count: int | Array
 
     def is_done(self, done: Done) -> Bool[Array, ""]:
         """Once all are made."""
