@@ -342,6 +342,8 @@ def _draw_reliability(panel: Any, result: dict[str, Any]) -> None:
         panel.plot(foreseen, np.maximum(stalled, least), "o", ms=4, color=colour, label=label)
     panel.set_xscale("log")
     panel.set_yscale("log")
+    # Room for the legend.
+    panel.set_ylim(0.5 * least, 200.0)
     panel.set_title("stalls", fontsize=9)
     panel.set_xlabel("probability, foreseen", fontsize=8)
     panel.set_ylabel("part that stalled", fontsize=8)
