@@ -169,7 +169,7 @@ def _uneven_floor(loads: Sequence[Mapping[str, Any]], pile: Pile, site: Site) ->
     if not len(uneven):
         return []
     return [
-        f"the floor ahead of {_loads(uneven, 'is', 'are')} not level, off by up to "
+        f"the floor ahead of {_loads(uneven, 'is', 'is')} not level, off by up to "
         f"{worst.max():.1f} m: the models know level floors alone and do not foresee a stall "
         f"there; go by what was played"
     ]
