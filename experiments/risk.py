@@ -1,7 +1,7 @@
-"""Stalls: how well they are foreseen, on new cycles and in plans, and whether caution pays.
+"""Stalls: how well they are foreseen, on new cycles and in plans; whether caution and mending pay.
 
-Greedy plans in the hybrid world, with caution of several kinds and none, each dig at the toe of the
-pile as the simulator has it, all of it played there.
+Greedy plans in the hybrid and the low world, with caution of several kinds and none, each dig at
+the toe of the pile as the simulator has it, all of it played there.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from wlplan.planning.terms import TERMS
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, GREEN, ORANGE, new_figure, tidy
 from wlplan.training.stall import stall_report
-from wlplan.types import LoadingPlan, Pile
+from wlplan.types import LoadingPlan, Performance, Pile
 from wlplan.worlds.shipped import pretrained_path
 
 LOADS, SLOPE_DEGREES, SEEDS = 15, 30.0, (1, 2, 3)
@@ -53,22 +53,25 @@ _TIMEOUT = STOP_REASONS.index("timeout")
 class Cautious(struct.PyTreeNode):
     """A learned world that carries the weights of caution: with others nothing is compiled anew."""
 
-    world: wlplan.LearnedWorld
+    world: Any
     weights: Float[Array, "2"]  # of the terms "stall" and "deviation"
 
     differentiable = has_stall_probability = has_uncertainty = True
 
-    def __call__(self, *loading):
+    def __call__(self, *loading: Any) -> tuple[Pile, Performance]:
         """As the world."""
-        return self.world(*loading)
+        outcome: tuple[Pile, Performance] = self.world(*loading)
+        return outcome
 
-    def stall_probability(self, *loading):
+    def stall_probability(self, *loading: Any) -> Array:
         """As the world."""
-        return self.world.stall_probability(*loading)
+        likely: Array = self.world.stall_probability(*loading)
+        return likely
 
-    def uncertainty(self, *loading):
+    def uncertainty(self, *loading: Any) -> Performance:
         """As the world."""
-        return self.world.uncertainty(*loading)
+        deviation: Performance = self.world.uncertainty(*loading)
+        return deviation
 
 
 def caution(loading: wlplan.Loading) -> Float[Array, ""]:
@@ -129,7 +132,9 @@ def played(
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """What all plans together say, and each of them."""
     held_out = read_description(pretrained_path("stall"), "stall")["held_out"]
-    level = [row for row in rows if row["pile"] != "bundled"]
+    # Loads that were mended were made because they stalled.
+    once = [row for row in rows if not row["caution"].endswith("mended")]
+    level = [row for row in once if row["pile"] != "bundled"]
     of_world: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         of_world.setdefault(row["world"], []).append(row)
@@ -137,7 +142,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "slope_degrees": SLOPE_DEGREES,
         "planner": "greedy",
         "held_out": held_out,
-        "plans": {"all": _calibration(rows), "level floors": _calibration(level)},
+        "plans": {"all": _calibration(once), "level floors": _calibration(level)},
         "caution": {
             name: {
                 kind: _compared(mine, kind)
@@ -145,7 +150,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
             }
             for name, mine in of_world.items()
         },
-        "floor": {name: _floors(mine) for name, mine in of_world.items()},
+        "floor": {
+            name: _floors([row for row in mine if row in once]) for name, mine in of_world.items()
+        },
     }
     return {**result, "rows": rows}
 
@@ -335,6 +342,8 @@ def _draw_reliability(panel: Any, result: dict[str, Any]) -> None:
         panel.plot(foreseen, np.maximum(stalled, least), "o", ms=4, color=colour, label=label)
     panel.set_xscale("log")
     panel.set_yscale("log")
+    # Room for the legend.
+    panel.set_ylim(0.5 * least, 200.0)
     panel.set_title("stalls", fontsize=9)
     panel.set_xlabel("probability, foreseen", fontsize=8)
     panel.set_ylabel("part that stalled", fontsize=8)

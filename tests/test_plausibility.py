@@ -74,6 +74,18 @@ def test_a_face_that_the_model_never_saw_is_named() -> None:
     assert remarks_on(document({}, {}, {}), PILE, SITE, faces=steep) == []
 
 
+@pytest.mark.parametrize(("fall", "said"), [(0.0, False), (0.01, False), (0.06, True)])
+def test_a_floor_that_is_not_level_is_said(fall: float, said: bool) -> None:
+    """The floor falls along x by so many metres a metre; the dig is on the west of the pile."""
+    ground = (-fall * X).astype(np.float32)
+    pile = Pile(HEIGHT + ground, 0.1, (-15.0, -15.0), ground=ground)
+    load = {"x": -4.0, "y": 0.0, "heading": 0.0}
+    found = remarks_on(document(load), pile, SITE, seen=SEEN)
+    assert any("floor ahead of load 1 is not level, off by up to 0.2 m" in f for f in found) is said
+    # In the simulator the floor is seen.
+    assert not any("not level" in one for one in remarks_on(document(load), pile, SITE))
+
+
 def test_a_truck_on_the_pile_or_on_unseen_ground_is_said() -> None:
     on = SITE.replace(receiver=Receiver(*(jnp.float32(v) for v in (4.0, 0.0, math.pi))))
     (said,) = remarks({}, site=on)

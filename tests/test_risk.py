@@ -147,11 +147,15 @@ def test_to_plan_for_what_the_world_does_not_know_is_refused(pile: Pile, name: s
 
 
 def test_a_plan_says_how_likely_its_loads_stall_and_caution_makes_it_less_so(pile: Pile) -> None:
+    # The truck stands in the north, where loads are most likely to stall.
+    site = Site(receiver=wlplan.Receiver(*(jnp.float32(v) for v in (0.0, 11.0, 0.0))))
     plain = {"time": 1.0, "touching": 0.1}
     found = {}
     for weight in (0.0, 40.0):
         goal = wlplan.Objective({**plain, "stall": weight})
-        plan = wlplan.plan_loads(KNOWS, pile, loads=2, objective=goal, planner=QUICK, referee=PLAIN)
+        plan = wlplan.plan_loads(
+            KNOWS, pile, loads=2, objective=goal, planner=QUICK, site=site, referee=PLAIN
+        )
         y = np.asarray(plan.plan.pose.y)
         assert plan.stall_probability is not None
         np.testing.assert_allclose(plan.stall_probability, 1.0 / (1.0 + np.exp(-2.0 * y)), 1e-4)
@@ -160,9 +164,8 @@ def test_a_plan_says_how_likely_its_loads_stall_and_caution_makes_it_less_so(pil
         assert plan.refereed.stall_probability is None
         assert not np.asarray(plan.refereed.terms["stall"]).any()
         found[weight] = float(np.max(plan.stall_probability))
+    assert found[0.0] > 0.5
     assert found[40.0] < 0.05
-    # Without caution nothing keeps it in the south.
-    assert found[40.0] < found[0.0]
 
 
 def test_a_plan_is_played_where_nothing_is_known(pile: Pile) -> None:

@@ -174,8 +174,7 @@ class Loads(Amount):
 
 @no_type_check
 class SomeLoads(Amount):
-    """A part of many `Loads`: as many rows as every other part, the last of which need not all be
-    made."""
+    """A part of many `Loads`, of as many rows as the others; of the last not all need be made."""
 
     count: int | Array
 
