@@ -1,7 +1,7 @@
 """A place for each truck: planned, played again, written, read and drawn."""
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ from wlplan.planning.job import make_job, with_toe
 from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.planners import Greedy
 from wlplan.planning.playing import PlanResult
-from wlplan.planning.truck_search import TruckSearch, search_of
 from wlplan.report import figures
 from wlplan.report.document import plan_document
 from wlplan.report.stands import stands_of
@@ -26,6 +25,7 @@ from wlplan.site.stands import stands
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 
 GREEDY = Greedy(actions=8, refine_steps=10, refined=2, poses_per_metre=0.5)
+PLANNED: tuple[Literal["auto"], Literal["each"]] = ("auto", "each")
 # West and east of the cone.
 PLACES = np.array([[-12.5, 4.0, 1.3], [12.5, -4.0, -1.84], [-12.5, 4.0, 1.3]])
 
@@ -84,11 +84,10 @@ def test_places_and_trucks_have_to_fit() -> None:
         with_toe(make_job(bowl_world, cone(), site=site))
 
 
-def test_what_is_no_search_is_told() -> None:
-    assert search_of(None) is None
-    assert search_of("each") == TruckSearch(each=True)
+def test_what_does_not_go_with_trucks_is_told() -> None:
+    other: Any = "best"
     with pytest.raises(InputError, match="the truck is 'best': give 'auto' or 'each'"):
-        search_of("best")
+        plan_loads(bowl_world, cone(), truck=other)
     for amount in (Loads(3), None):
         with pytest.raises(InputError, match="goes with an amount of trucks"):
             plan_loads(bowl_world, cone(), amount=amount, truck="each")
@@ -120,8 +119,7 @@ def test_each_truck_stands_where_its_loads_are() -> None:
     pile: Any = wide_cone()
     amount = Trucks(2, 2.8)
     one, each = (
-        plan_loads(sides_world, pile, amount=amount, planner=GREEDY, truck=name)
-        for name in ("auto", "each")
+        plan_loads(sides_world, pile, amount=amount, planner=GREEDY, truck=name) for name in PLANNED
     )
     assert one.receiver is not None
     assert np.ndim(one.receiver.x) == 0

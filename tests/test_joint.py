@@ -1,4 +1,4 @@
-"""The place of the truck and the digs of a plan refined together."""
+"""The place of the truck and the digs of a plan refined together, as an experiment does."""
 
 from typing import Any
 
@@ -9,18 +9,18 @@ from cones import SITE, bowl_world, circle, cone
 from laws import assert_gradient
 from precision import in_float64
 
-from wlplan.planning.amounts import Trucks
-from wlplan.planning.job import Decisions, Job, make_job, with_toe
-from wlplan.planning.joint import (
+from experiments._common.joint import (
     Placed,
     _allowed,
     _shortest_mixture,
-    at_receiver,
     cost_of_placed,
     refined,
 )
+from wlplan.planning.amounts import Trucks
+from wlplan.planning.job import Decisions, Job, make_job, with_toe
 from wlplan.planning.placement import place_of
 from wlplan.planning.playing import outcomes
+from wlplan.planning.spots import at_receiver
 from wlplan.planning.watch import Watch
 
 

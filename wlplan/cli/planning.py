@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -126,7 +126,7 @@ def plan(
                     objective=goal,
                     planner=chosen,
                     site=place,
-                    truck=truck if isinstance(truck, str) else None,
+                    truck=cast("Any", truck if isinstance(truck, str) else None),
                     seed=seed,
                     referee=simulator if referee and not in_simulator else None,
                     progress=progress,

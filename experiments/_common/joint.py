@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 from wlplan.planning.job import Decisions, Job, contour_length
 from wlplan.planning.placement import place_of, receiver_at
 from wlplan.planning.playing import play_candidate
+from wlplan.planning.spots import at_receiver
 from wlplan.planning.watch import Watch
 from wlplan.site.receiver import Receiver
 from wlplan.xla import ParallelMap
@@ -41,12 +42,6 @@ class Placed(struct.PyTreeNode):
 
     receiver: Receiver
     plan: Decisions
-
-
-def at_receiver(job: Job, receiver: Receiver) -> Job:
-    """A job whose truck stands somewhere else."""
-    moved: Job = job.replace(site=job.site.replace(receiver=receiver))
-    return moved
 
 
 def cost_of_placed(job: Job, placed: Placed, truck: Array | None = None) -> Float[Array, ""]:
