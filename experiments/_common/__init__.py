@@ -1,1 +1,1 @@
-"""What the experiments share: results with their conditions, simulated cycles, models, a descent."""
+"""What the experiments share: results with conditions, simulated cycles, models, a descent."""
