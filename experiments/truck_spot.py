@@ -79,7 +79,7 @@ def one(name: str, pile: Pile, kind: str, trucks: int, preset: str) -> dict[str,
         amount, steps = wlplan.Trucks(trucks // 2, 5.0), 1
     hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
     begun = time.perf_counter()
-    truck: Any = {"default": None, "each": "each"}.get(kind, "auto")
+    truck = {"default": None, "each": "each"}.get(kind, "auto")
     plan = wlplan.plan_loads(hybrid, pile, amount=amount, planner=planner, truck=truck)
     if kind == "auto, refined":
         plan = _refined(hybrid, pile, amount, planner, plan, steps)

@@ -1,7 +1,7 @@
 """A place for each truck: planned, played again, written, read and drawn."""
 
 import math
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,6 @@ from wlplan.site.stands import stands
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 
 GREEDY = Greedy(actions=8, refine_steps=10, refined=2, poses_per_metre=0.5)
-PLANNED: tuple[Literal["auto"], Literal["each"]] = ("auto", "each")
 # West and east of the cone.
 PLACES = np.array([[-12.5, 4.0, 1.3], [12.5, -4.0, -1.84], [-12.5, 4.0, 1.3]])
 
@@ -85,9 +84,8 @@ def test_places_and_trucks_have_to_fit() -> None:
 
 
 def test_what_does_not_go_with_trucks_is_told() -> None:
-    other: Any = "best"
     with pytest.raises(InputError, match="the truck is 'best': give 'auto' or 'each'"):
-        plan_loads(bowl_world, cone(), truck=other)
+        plan_loads(bowl_world, cone(), truck="best")
     for amount in (Loads(3), None):
         with pytest.raises(InputError, match="goes with an amount of trucks"):
             plan_loads(bowl_world, cone(), amount=amount, truck="each")
@@ -119,7 +117,8 @@ def test_each_truck_stands_where_its_loads_are() -> None:
     pile: Any = wide_cone()
     amount = Trucks(2, 2.8)
     one, each = (
-        plan_loads(sides_world, pile, amount=amount, planner=GREEDY, truck=name) for name in PLANNED
+        plan_loads(sides_world, pile, amount=amount, planner=GREEDY, truck=name)
+        for name in ("auto", "each")
     )
     assert one.receiver is not None
     assert np.ndim(one.receiver.x) == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -126,7 +126,7 @@ def plan(
                     objective=goal,
                     planner=chosen,
                     site=place,
-                    truck=cast("Any", truck if isinstance(truck, str) else None),
+                    truck=truck if isinstance(truck, str) else None,
                     seed=seed,
                     referee=simulator if referee and not in_simulator else None,
                     progress=progress,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ def plan_loads(
     objective: str | Objective | Mapping[str, Any] | Callable[..., Any] | None = None,
     planner: str | Planner = "gradient",
     site: Site | None = None,
-    truck: Literal["auto", "each"] | None = None,
+    truck: str | None = None,
     seed: int = 0,
     referee: World | None = None,
     progress: Progress | None = None,
@@ -85,7 +85,8 @@ def plan_loads(
         how the referee saw it.
 
     Raises:
-        InputError: If there is nothing to dig, no load is asked for, a name is unknown, the
+        InputError: If there is nothing to dig, no load is asked for, a name is unknown, each truck
+            is to have a place and there are none, there is no room in the area for trucks, the
             planner needs a gradient that the world does not have, or no plan has a finite cost.
         KeyboardInterrupt: If there was no plan yet.
     """
