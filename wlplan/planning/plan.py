@@ -85,9 +85,9 @@ def plan_loads(
         how the referee saw it.
 
     Raises:
-        InputError: If there is nothing to dig, no load is asked for, a name is unknown, each truck
-            is to have a place and there are none, there is no room in the area for trucks, the
-            planner needs a gradient that the world does not have, or no plan has a finite cost.
+        InputError: If there is nothing to dig, no load is asked for, a name is unknown, "each"
+            is asked for without trucks, there is no room in the area for trucks, the planner needs
+            a gradient that the world does not have, or no plan has a finite cost.
         KeyboardInterrupt: If there was no plan yet.
     """
     if amount is None:
