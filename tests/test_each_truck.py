@@ -115,7 +115,7 @@ def sides_world(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performan
 @pytest.mark.slow
 def test_each_truck_stands_where_its_loads_are() -> None:
     pile: Any = wide_cone()
-    amount = Trucks(2, 2.8)
+    amount = Trucks(2, 1.6)
     one, each = (
         plan_loads(sides_world, pile, amount=amount, planner=GREEDY, truck=name)
         for name in ("auto", "each")
