@@ -42,7 +42,7 @@ from wlplan.planning.planners import (
     TreeSearch,
 )
 from wlplan.planning.proposals import Planner
-from wlplan.planning.truck_search import TruckSearch
+from wlplan.planning.truck_search import best_place
 from wlplan.planning.watch import Watch
 from wlplan.plugins import load_object
 from wlplan.report.figures import png_bytes
@@ -170,8 +170,8 @@ def place_truck(instance: Instance, seed: int, folder: Path) -> Receiver | None:
             objective=amount.objective,
             amount=first[0],
         )
-        found = TruckSearch().place(with_toe(job), site, first[1], seed=seed, watch=Watch())
-        place = [float(value) for value in jax.tree.leaves(found.receiver)]
+        found = best_place(with_toe(job), site, first[1], seed=seed, watch=Watch())
+        place = [float(value) for value in jax.tree.leaves(found)]
         write_text_atomic(path, json.dumps(place))
     return Receiver(*(jnp.asarray(v, pile.height.dtype) for v in json.loads(path.read_text())))
 

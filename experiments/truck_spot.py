@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import time
@@ -13,13 +12,19 @@ import jax
 import numpy as np
 
 import wlplan
+from experiments._common.joint import refined
 from experiments._common.results import main
 from wlplan.io import bundled_pile_path, write_bytes_atomic
-from wlplan.planning.plan import play
+from wlplan.planning.amounts import Made, typical_load
+from wlplan.planning.job import make_job, with_toe
+from wlplan.planning.placement import not_for_trucks, truck_stands_on
+from wlplan.planning.plan import choose, play
 from wlplan.planning.planners import Greedy
-from wlplan.planning.truck_search import TruckSearch
+from wlplan.planning.proposals import Proposals
+from wlplan.planning.spots import at_receiver
+from wlplan.planning.watch import Watch
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.style import BLUE, FAINT, ORANGE, PALE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, GREEN, ORANGE, new_figure, tidy
 from wlplan.site.site import Site
 from wlplan.types import Pile
 
@@ -28,13 +33,9 @@ SLOPE_DEGREES, SEEDS = 30.0, (1, 2, 3)
 TRUCKS, PAYLOAD = 2, 24.0
 # Enough trucks that the pile changes, on some of the piles.
 MANY_TRUCKS, MANY_ON = 4, ("bundled", "conical 1", "triangular 2")
-SEARCHES = {
-    "default": None,
-    "auto, not refined": TruckSearch(refine_steps=0),
-    "auto": TruckSearch(),
-    "each": TruckSearch(each=True),
-}
-"""Where the trucks stand, by name."""
+KINDS = ("default", "auto", "auto, refined", "each")
+# Steps of the descent of place and digs together.
+STEPS = 16
 
 
 def piles(preset: str) -> dict[str, Pile]:
@@ -55,7 +56,7 @@ def run(preset: str) -> dict[str, Any]:
     """Greedy plans in the hybrid world with trucks here and there, played in the simulator."""
     rows = []
     for name, pile in piles(preset).items():
-        kinds = ("default", "auto, not refined", "auto")
+        kinds = KINDS[:3]
         rows += [one(name, pile, kind, TRUCKS, preset) for kind in kinds]
         if preset == "smoke" or name in MANY_ON:
             rows += [one(name, pile, kind, MANY_TRUCKS, preset) for kind in ("auto", "each")]
@@ -68,18 +69,20 @@ def one(name: str, pile: Pile, kind: str, trucks: int, preset: str) -> dict[str,
     Args:
         name: Of the pile.
         pile: The pile.
-        kind: One of `SEARCHES`.
+        kind: One of `KINDS`.
         trucks: To be filled.
         preset: Of the experiment.
     """
-    search, planner, amount = SEARCHES[kind], Greedy(), wlplan.Trucks(trucks, PAYLOAD)
+    planner, amount, steps = Greedy(), wlplan.Trucks(trucks, PAYLOAD), STEPS
     if preset == "smoke":
         planner = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3)
-        amount = wlplan.Trucks(min(trucks // 2, 2), 5.0)
-        search = search and dataclasses.replace(search, refine_steps=min(search.refine_steps, 1))
+        amount, steps = wlplan.Trucks(trucks // 2, 5.0), 1
     hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
     begun = time.perf_counter()
-    plan = wlplan.plan_loads(hybrid, pile, amount=amount, planner=planner, truck=search)
+    truck = {"default": None, "each": "each"}.get(kind, "auto")
+    plan = wlplan.plan_loads(hybrid, pile, amount=amount, planner=planner, truck=truck)
+    if kind == "auto, refined":
+        plan = _refined(hybrid, pile, amount, planner, plan, steps)
     site = Site(receiver=plan.receiver)
     played = play(simulator, pile, plan.plan, amount=amount, objective="delivery", site=site)
     row = {
@@ -95,6 +98,34 @@ def one(name: str, pile: Pile, kind: str, trucks: int, preset: str) -> dict[str,
     }
     print(json.dumps(row), flush=True)
     return row
+
+
+def _refined(
+    world: wlplan.World,
+    pile: Pile,
+    amount: wlplan.Trucks,
+    planner: Greedy,
+    plan: wlplan.PlanResult,
+    steps: int,
+) -> wlplan.PlanResult:
+    """The plan that a descent of place and digs makes of a greedy one, if it costs less."""
+    site = Site(receiver=plan.receiver)
+    job = with_toe(make_job(world, pile, site=site, objective="delivery", amount=amount))
+    part: Any = amount.part(Made(), typical_load(job.site))
+    job = job.replace(amount=part[0])
+    start = jax.tree.map(lambda leaf: leaf[0], planner.propose(job, part[1], seed=0).candidates)
+    blocked = not_for_trucks(pile)
+
+    def may_stand(places: np.ndarray) -> np.ndarray:
+        room: np.ndarray = truck_stands_on(places, pile, blocked, job.site.machine)[0] == 0.0
+        return room
+
+    watch = Watch()
+    placed = refined(job, start, may_stand, steps=steps, watch=watch)
+    found = choose(at_receiver(job, placed.receiver), Proposals(placed.plan))
+    better = found if float(found.cost) < float(plan.cost) else plan
+    receiver = placed.receiver if better is found else plan.receiver
+    return better.replace(receiver=receiver, spent=plan.spent + watch.spent)
 
 
 def _summary(outcome: wlplan.PlanResult) -> dict[str, float]:
@@ -116,11 +147,11 @@ def draw(folder: Path) -> None:
     rows = json.loads((folder / "truck_spot.json").read_text())["rows"]
     figure = new_figure(9.0, 3.4)
     left, right = figure.subplots(1, 2, width_ratios=(3.0, 1.3), sharey=True)
-    colours = {"default": FAINT, "auto, not refined": PALE, "auto": BLUE, "each": ORANGE}
+    colours = dict(zip(KINDS, (FAINT, BLUE, GREEN, ORANGE), strict=True))
     for panel, trucks in ((left, TRUCKS), (right, MANY_TRUCKS)):
         some = [row for row in rows if row["trucks"] == trucks]
         names = list(dict.fromkeys(row["pile"] for row in some))
-        kinds = [kind for kind in SEARCHES if any(row["truck"] == kind for row in some)]
+        kinds = [kind for kind in KINDS if any(row["truck"] == kind for row in some)]
         width = 0.8 / max(len(kinds), 1)
         for number, kind in enumerate(kinds):
             found = [row for row in some if row["truck"] == kind]

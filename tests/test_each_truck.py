@@ -15,7 +15,6 @@ from wlplan.planning.job import make_job, with_toe
 from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.planners import Greedy
 from wlplan.planning.playing import PlanResult
-from wlplan.planning.truck_search import TruckSearch, search_of
 from wlplan.report import figures
 from wlplan.report.document import plan_document
 from wlplan.report.stands import stands_of
@@ -84,11 +83,9 @@ def test_places_and_trucks_have_to_fit() -> None:
         with_toe(make_job(bowl_world, cone(), site=site))
 
 
-def test_what_is_no_search_is_told() -> None:
-    assert search_of(None) is None
-    assert search_of("each") == TruckSearch(each=True)
+def test_what_does_not_go_with_trucks_is_told() -> None:
     with pytest.raises(InputError, match="the truck is 'best': give 'auto' or 'each'"):
-        search_of("best")
+        plan_loads(bowl_world, cone(), truck="best")
     for amount in (Loads(3), None):
         with pytest.raises(InputError, match="goes with an amount of trucks"):
             plan_loads(bowl_world, cone(), amount=amount, truck="each")
@@ -118,7 +115,7 @@ def sides_world(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performan
 @pytest.mark.slow
 def test_each_truck_stands_where_its_loads_are() -> None:
     pile: Any = wide_cone()
-    amount = Trucks(2, 2.8)
+    amount = Trucks(2, 1.6)
     one, each = (
         plan_loads(sides_world, pile, amount=amount, planner=GREEDY, truck=name)
         for name in ("auto", "each")
@@ -166,7 +163,8 @@ def test_old_plans_name_one_place() -> None:
     for document in ({"receiver": place}, {"receiver": place, "trucks": [{"loads": [0]}] * 2}):
         assert stands_of(document) == [("truck", place)]
     assert stands_of({"trucks": [place, place]}) == [("truck", place)]
-    for nothing in ({}, {"receiver": None}, {"trucks": 3, "receiver": 4}, {"receiver": {"x": 1.0}}):
+    none: list[dict[str, Any]] = [{}, {"receiver": None}, {"trucks": 3, "receiver": 4}]
+    for nothing in none:
         assert stands_of(nothing) == []
 
 

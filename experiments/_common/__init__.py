@@ -1,1 +1,1 @@
-"""What the experiments share: results with their conditions, cycles simulated again, and models."""
+"""What the experiments share: results with conditions, simulated cycles, models, a descent."""

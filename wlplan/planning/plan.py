@@ -22,7 +22,6 @@ from wlplan.planning.job import (
     make_job,
     with_toe,
 )
-from wlplan.planning.joint import at_receiver
 from wlplan.planning.load_search import price_of
 from wlplan.planning.mending import mended
 from wlplan.planning.objective import Objective
@@ -36,7 +35,8 @@ from wlplan.planning.playing import (
     outcomes,
 )
 from wlplan.planning.proposals import NothingWorthIt, Planner, Progress, Proposals
-from wlplan.planning.truck_search import TruckSearch, search_of
+from wlplan.planning.spots import at_receiver
+from wlplan.planning.truck_search import TRUCKS, best_place
 from wlplan.planning.watch import Watch
 from wlplan.site.receiver import Receiver, receiver_count
 from wlplan.site.site import Site
@@ -57,7 +57,7 @@ def plan_loads(
     objective: str | Objective | Mapping[str, Any] | Callable[..., Any] | None = None,
     planner: str | Planner = "gradient",
     site: Site | None = None,
-    truck: str | TruckSearch | None = None,
+    truck: str | None = None,
     seed: int = 0,
     referee: World | None = None,
     mend: bool = True,
@@ -80,8 +80,8 @@ def plan_loads(
         site: Machine, soil and receiver; default: the WA320 in gravel, and a receiver beside the
             pile, see `wlplan.planning.placement`.
         truck: "auto": the planner chooses where it stands, see `wlplan.planning.truck_search`;
-            "each": for each truck of `Trucks` anew; or a search with settings of its own. The
-            result says where. None: at the receiver of the site.
+            "each": for each truck of `Trucks` anew. The result says where. None: at the receiver of
+            the site.
         seed: Of everything random.
         referee: World that plays the planner's candidates, each dig at the toe of the pile as the
             referee has it by then, and picks the cheapest; the poses of the result are the ones
@@ -99,8 +99,9 @@ def plan_loads(
         how the referee saw it.
 
     Raises:
-        InputError: If there is nothing to dig, no load is asked for, a name is unknown, the
-            planner needs a gradient that the world does not have, or no plan has a finite cost.
+        InputError: If there is nothing to dig, no load is asked for, a name is unknown, "each"
+            is asked for without trucks, there is no room in the area for trucks, the planner needs
+            a gradient that the world does not have, or no plan has a finite cost.
         KeyboardInterrupt: If there was no plan yet.
     """
     if amount is None:
@@ -116,11 +117,13 @@ def plan_loads(
     checked = None
     if referee is not None:
         checked = make_job(referee, pile, site=job.site, contour=contour).world
-    chosen, search = planner_of(planner, job.world), search_of(truck)
+    chosen = planner_of(planner, job.world)
     watch, made = Watch(progress, budget), Made()
     parts: list[PlanResult] = []
     typical = typical_load(job.site)
-    each = search is not None and search.each
+    if truck not in (None, *TRUCKS):
+        raise InputError(f"the truck is {truck!r}: give {' or '.join(map(repr, TRUCKS))}, or none.")
+    each = truck == "each"
     if each and not isinstance(amount, Trucks):
         raise InputError(
             "a place for each truck goes with an amount of trucks: give how many and their "
@@ -130,13 +133,13 @@ def plan_loads(
     receivers: list[Receiver] = []
     while not watch.stopped and (part := next_part(made, typical)) is not None:
         of_part, rows = job.replace(amount=part[0]), part[1]
-        proposals, found = None, None
+        proposals = None
         try:
             with watch.ending():
                 of_part = with_toe(of_part, None if parts else contour)
-                if search is not None and (search.each or not parts):
-                    found = search.place(of_part, site, rows, seed=seed, watch=watch)
-                    job, of_part = (at_receiver(one, found.receiver) for one in (job, of_part))
+                if each or (truck == "auto" and not parts):
+                    place = best_place(of_part, site, rows, seed=seed, watch=watch)
+                    job, of_part = at_receiver(job, place), at_receiver(of_part, place)
                 if isinstance(part[0], Tonnes):
                     # Until loads were planned, by those that could be made.
                     price = _price(parts) if parts else price_of(of_part, seed, watch)
@@ -153,7 +156,6 @@ def plan_loads(
             proposals = Proposals(watch.best.plan)
         if proposals is None:
             break
-        proposals = _with(proposals, found and found.plan)
         result = choose(of_part, proposals, referee=checked, mend=mend)
         if not len(result.costs):
             break
@@ -170,26 +172,6 @@ def plan_loads(
     if each:
         receiver = jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers)
     return joined(parts).replace(receiver=receiver, spent=watch.spent, stopped=watch.stopped)
-
-
-def _with(proposals: Proposals, plan: Decisions | None) -> Proposals:
-    """The proposals, and a plan to pick from besides; not where a planner hands over others."""
-    candidates: Any = proposals.candidates
-    if plan is None:
-        return proposals
-    if jnp.ndim(jax.tree.leaves(candidates)[0]) == 1:
-        candidates = jax.tree.map(lambda leaf: leaf[None], candidates)
-    one = jax.tree.map(lambda leaf: leaf[None], plan)
-    if _shape_of_row(candidates) != _shape_of_row(one):
-        return proposals
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), candidates, one)
-    return proposals._replace(candidates=both)
-
-
-def _shape_of_row(plans: Decisions | LoadingPlan) -> Any:
-    """What plans of one kind and length have in common, leaves [K, ...]."""
-    leaves, tree = jax.tree.flatten(plans)
-    return tree, [leaf.shape[1:] for leaf in leaves]
 
 
 def _price(parts: Sequence[PlanResult]) -> float:

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 
 from wlplan.actions import spread_actions, squash
 from wlplan.planning.job import Job, beginning
-from wlplan.planning.joint import at_receiver
 from wlplan.planning.loading import Loading, Transport
 from wlplan.planning.placement import (
     Closed,
@@ -112,6 +111,12 @@ def best_spots(
         if all(np.hypot(*(places[row, :2] - other[:2])) > _APART for other in chosen):
             chosen.append(places[row])
     return [receiver_at(place, pile) for place in chosen[:TRIED]]
+
+
+def at_receiver(job: Job, receiver: Receiver) -> Job:
+    """A job whose truck stands somewhere else."""
+    moved: Job = job.replace(site=job.site.replace(receiver=receiver))
+    return moved
 
 
 def _yields_of(

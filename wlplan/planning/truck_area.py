@@ -68,13 +68,13 @@ def places_inside(area: tuple[Polygon, ...], machine: WheelLoader) -> Float[np.n
         row, turn = (a.ravel() for a in np.meshgrid(np.arange(len(points)), turns, indexing="ij"))
         tried.append(np.concatenate([points[row], turn[:, None]], axis=1))
     places = _shifted(np.concatenate(tried), -0.5 * (near + far))
-    places = places[stands_inside(places, area, machine)]
-    if not len(places):
+    inside: np.ndarray = places[stands_inside(places, area, machine)]
+    if not len(inside):
         raise InputError(
             f"no truck, {2.0 * half:.1f} m by {far - near:.1f} m, fits into the area for trucks: "
             f"draw it larger."
         )
-    return places
+    return inside
 
 
 def nearest_of(

@@ -20,9 +20,10 @@ def stands_of(document: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]
     trucks = document.get("trucks")
     places = [truck for truck in trucks if _is_place(truck)] if isinstance(trucks, list) else []
     if not places or len(places) < len(trucks or ()):
+        # One that lacks a number is for the page to show so.
         receiver: Any = document.get("receiver")
-        places = [receiver] if _is_place(receiver) else []
-    keys = [tuple(str(place[name]) for name in _FIELDS) for place in places]
+        places = [receiver] if isinstance(receiver, Mapping) and receiver else []
+    keys = [tuple(str(place.get(name)) for name in _FIELDS) for place in places]
     return [(who, places[truck]) for who, truck in stands(keys)] if places else []
 
 
