@@ -28,6 +28,8 @@ DATA = Path("out") / "cycles.zarr"
 CYCLES, SMOKE_CYCLES = 10_800, 180
 # The models that experiments train, see `experiments._common.models`.
 MODELS = Path("out") / "models"
+# The rows of those that go on where they were cut short, see `experiments._common.rows`.
+ROWS = Path("out") / "rows"
 
 
 def conditions() -> dict[str, Any]:
@@ -90,8 +92,8 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
 
     Args:
         name: Name of its module.
-        run: Function of the preset to the result; of a data set and of the folder of trained models
-            too if it has parameters `data` and `models`.
+        run: Function of the preset to the result; of a data set, of the folder of trained models
+            and of the file of rows too if it has parameters `data`, `models` and `rows`.
         draw: Draws the result that lies in a folder there.
     """
     needs = inspect.signature(run).parameters
@@ -117,6 +119,8 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
     if not options.draw:
         more: dict[str, Any] = {}
         smoke = options.preset == "smoke"
+        if "rows" in needs:
+            more["rows"] = (options.out if smoke else ROWS) / f"{name}.jsonl"
         if "models" in needs:
             more["models"] = options.models or (options.out / MODELS.name if smoke else MODELS)
         if needs_data:
