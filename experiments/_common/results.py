@@ -92,8 +92,9 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
 
     Args:
         name: Name of its module.
-        run: Function of the preset to the result; of a data set, of the folder of trained models
-            and of the file of rows too if it has parameters `data`, `models` and `rows`.
+        run: Function of the preset to the result; of a data set, of the folder of trained models,
+            of the file of rows and of the folder of results too if it has parameters `data`,
+            `models`, `rows` and `out`.
         draw: Draws the result that lies in a folder there.
     """
     needs = inspect.signature(run).parameters
@@ -119,6 +120,8 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
     if not options.draw:
         more: dict[str, Any] = {}
         smoke = options.preset == "smoke"
+        if "out" in needs:
+            more["out"] = options.out
         if "rows" in needs:
             more["rows"] = (options.out if smoke else ROWS) / f"{name}.jsonl"
         if "models" in needs:
