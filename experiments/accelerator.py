@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import resource
 import sys
 import time
@@ -30,7 +31,7 @@ from wlplan.io import write_bytes_atomic
 from wlplan.planning.amounts import Loads
 from wlplan.planning.job import make_job
 from wlplan.planning.placement import beside
-from wlplan.planning.planners import Gradient, Greedy, Nominal
+from wlplan.planning.planners import Gradient, Greedy
 from wlplan.planning.playing import costs_and_gradients, cusps_of_plans
 from wlplan.planning.rollout import rollout
 from wlplan.report.figures import png_bytes
@@ -45,8 +46,8 @@ from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.training import PsiLowSettings, train
 from wlplan.types import LoadingPlan, Pile, Pose, action_from
 
-# All of it, and a part's share of what is then left [s].
-LIMIT, SHARE = 540.0, 0.3
+# For all of it [s].
+LIMIT = 540.0
 # Loads a second that are aimed at on an accelerator.
 GOAL = 1e5
 # Piles that a batch of diggability maps, of relaxations and of cycles is of; kinds come in turn.
@@ -71,7 +72,7 @@ SIZES = {
     "gpu": Sizes(
         15, ("hybrid", "low", "high"), (1, 16, 256, 4096), (1, 16, 256), 64, 150, 4096, 20, {}
     ),
-    "cpu": Sizes(15, ("hybrid", "low", "high"), (1, 16), (1, 4), 64, 150, 1024, 20, {}),
+    "cpu": Sizes(15, ("hybrid", "low", "high"), (1, 16), (1, 4), 64, 150, 384, 20, {}),
     "smoke": Sizes(
         2,
         ("low",),
@@ -88,16 +89,23 @@ SIZES = {
 
 
 class Clock:
-    """What is left of the time, and of a part's share of it."""
+    """What is left of the time, and of a part's share of it.
 
-    def __init__(self, limit: float):
-        self._end = time.perf_counter() + limit
-        self._of_part = self._end
+    Args:
+        limit: All of it [s].
+        shares: Of the parts, in their order; what one leaves over goes to those after it.
+    """
+
+    def __init__(self, limit: float, shares: list[float]):
+        self._end = self._of_part = time.perf_counter() + limit
+        self._shares = shares
 
     def begin(self) -> None:
-        """A part begins."""
+        """The next part begins."""
         now = time.perf_counter()
-        self._of_part = now + SHARE * max(self._end - now, 0.0)
+        part = self._shares[0] / sum(self._shares)
+        self._shares = self._shares[1:]
+        self._of_part = now + part * max(self._end - now, 0.0)
 
     def allows(self, seconds: float) -> bool:
         """Whether that fits into the part."""
@@ -146,7 +154,8 @@ class Inputs:
 
     def _actions(self, count: int) -> np.ndarray:
         low, high = np.array(ACTION_LOW), np.array(ACTION_HIGH)
-        return low + (high - low) * latin_hypercube(count, 4, self._random)
+        actions: np.ndarray = low + (high - low) * latin_hypercube(count, 4, self._random)
+        return actions
 
 
 def _floats(values: Any) -> jax.Array:
@@ -168,9 +177,10 @@ def _measure(
 ) -> tuple[dict[str, Any], Any]:
     """Compile time, time of a call, and memory of one program; and what it returned last."""
     if not clock.allows(foreseen):
-        return {"left_out": f"{foreseen:.0f} s were foreseen"}, None
+        return {"left_out": f"no time was left for {foreseen:.0f} s"}, None
     run, seconds = compiled(function, *case)
-    times, result = [], None
+    times: list[float] = []
+    result = None
     while len(times) < 2 or (len(times) < 20 and clock.allows(times[-1]) and sum(times) < 5.0):
         start = time.perf_counter()
         result = jax.block_until_ready(run(*case))
@@ -184,7 +194,7 @@ def _measure(
 
 def _foreseen(found: dict[str, Any], growth: float) -> float:
     """What a program that is so many times as large will take, compiling and two calls [s]."""
-    if "left_out" in found:
+    if "left_out" in found:  # neither does what is larger fit
         return math.inf
     return 1.5 * float(found["compile_s"]) + 2.0 * growth * float(found["call_s"])
 
@@ -213,7 +223,11 @@ def _gradients(clock: Clock, inputs: Inputs, name: str) -> Rows:
             continue
         plans = jax.device_get(inputs.plans(count))
         cusps = cusps_of_plans(job, plans)
-        found = _twice(lambda p=plans, c=cusps: costs_and_gradients(job, (p, c)))
+
+        def gradients(plans: LoadingPlan = plans, cusps: Any = cusps) -> Any:
+            return costs_and_gradients(job, (plans, cusps))
+
+        found = _twice(gradients)
         yield _a_second(found, "plans", count) | {"batch": count}
 
 
@@ -254,7 +268,8 @@ def _training(clock: Clock, inputs: Inputs, name: str) -> Rows:
     if made is None or not clock.allows(0.0):
         yield {"of": "training", "left_out": "no time was left"}
         return
-    data = _dataset(*jax.device_get(made), np.asarray(cycles[2]))
+    performance, seen = jax.device_get(made)
+    data = _dataset(performance, seen, np.asarray(cycles[2]))
     ends: list[float] = []
     settings = PsiLowSettings(epochs=sizes.epochs, batch=min(128, sizes.cycles // 8))
     begin = time.perf_counter()
@@ -282,13 +297,9 @@ def _dataset(performance: Any, seen: np.ndarray, action: np.ndarray) -> Dataset:
 def _planning(clock: Clock, inputs: Inputs, name: str) -> Rows:
     """The greedy and the gradient planner, whole, as a user calls them."""
     world, few = wlplan.load_world(name), inputs.sizes.planning
-    greedy = Greedy(**few)
-    planners: dict[str, Any] = {"greedy": greedy, "gradient": Gradient()}
-    if few:
-        nominal = Nominal(actions=6, refine_steps=2, rows=2)
-        planners["gradient"] = Gradient(
-            starts=2, iterations=2, candidates=3, greedy=greedy, nominal=nominal
-        )
+    planners: dict[str, Any] = {"greedy": Greedy(**few)}
+    if not few:
+        planners["gradient"] = Gradient()
     for title, planner in planners.items():
         if not clock.allows(0.0):
             yield {"of": title, "left_out": "no time was left"}
@@ -326,15 +337,16 @@ def _peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-PARTS: dict[str, Callable[[Clock, Inputs, str], Rows]] = {
-    "rollouts": _rollouts,
-    "diggability": _diggability,
-    "relaxation": _relaxations,
-    "planning": _planning,
-    "gradients": _gradients,
-    "training": _training,
+PARTS: dict[str, tuple[Callable[[Clock, Inputs, str], Rows], float]] = {
+    "rollouts": (_rollouts, 2.0),
+    "diggability": (_diggability, 1.0),
+    "relaxation": (_relaxations, 1.0),
+    "training": (_training, 1.0),
+    "gradients": (_gradients, 2.0),
+    "planning": (_planning, 4.0),
 }
-"""What is measured, by name, in this order; rollouts in further worlds come last."""
+"""What is measured, by name, in this order, and shares of the time; rollouts in further worlds come
+last."""
 
 
 def run(preset: str, out: Path) -> dict[str, Any]:
@@ -343,24 +355,26 @@ def run(preset: str, out: Path) -> dict[str, Any]:
     jax.config.update("jax_enable_compilation_cache", False)
     platform = jax.default_backend()
     sizes = SIZES["smoke" if preset == "smoke" else "cpu" if platform == "cpu" else "gpu"]
-    clock, inputs = Clock(LIMIT), Inputs(sizes)
     first, *others = sizes.worlds
     todo = [(part, first) for part in PARTS] + [("rollouts", world) for world in others]
+    clock, inputs = Clock(LIMIT, [PARTS[part][1] for part, _ in todo]), Inputs(sizes)
     result: dict[str, Any] = {
         "platform": platform,
         "devices": len(jax.devices()),
         "loads": sizes.loads,
         "goal_loads_a_second": GOAL,
         "seconds": 0.0,
+        "machine_load": 0.0,
         "rows": [],
     }
     begin = time.perf_counter()
     for part, world in todo:
         clock.begin()
-        for row in PARTS[part](clock, inputs, world):
+        for row in PARTS[part][0](clock, inputs, world):
             rounded = {k: round(v, 5) if isinstance(v, float) else v for k, v in row.items()}
             result["rows"].append({"part": part, "world": world} | rounded)
             result["seconds"] = round(time.perf_counter() - begin, 1)
+            result["machine_load"] = round(os.getloadavg()[0], 2)
             print(json.dumps(result["rows"][-1]), flush=True)
             write_result("accelerator", preset, result, out)
     return result

@@ -34,7 +34,7 @@ from wlplan.planning.planners import Greedy
 from wlplan.planning.poses import distance_to_toe
 from wlplan.planning.replanning import EXTENT, Replanner
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, tidy
 from wlplan.site.machine import WA320
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
@@ -90,13 +90,17 @@ CONDITIONS = {
 }
 """What is wrong, by name."""
 
-ONCE, REFEREED, ANEW = "once", "once, refereed", "after every scan"
-"""How is planned. The referee knows the soil, and sets the poses on the piles that it foresees."""
+ONCE, REFEREED, TRACED = "once", "once, refereed", "once, toe traced anew"
+ANEW = "after every scan"
+"""How is planned. The referee knows the soil, and sets the poses on the piles that it foresees. A
+greedy plan keeps to the toe of the first pile; with the toe traced anew it is what planning after
+every scan comes to if the model is right."""
 
 PLACE, TOE = "to the place", "to the toe"
 """How the loader gets to a dig."""
 
-WAYS = ((ONCE, PLACE), (ONCE, TOE), (REFEREED, PLACE), (ANEW, PLACE), (ANEW, TOE))
+OPEN = ((ONCE, PLACE), (ONCE, TOE), (REFEREED, PLACE), (TRACED, TOE))
+WAYS = (*OPEN, (ANEW, PLACE), (ANEW, TOE))
 """Both, as they are played."""
 
 Told = Callable[[int, Pile], LoadingPlan]
@@ -186,7 +190,7 @@ class _Bench:
         self._hybrid = wlplan.load_world("hybrid")
         self._pile = Replanner(self._hybrid, extent=SIDE).whole_map(pile)
         self._site = beside(Site(), pile)
-        self._once: dict[Scanner, LoadingPlan] = {}
+        self._once: dict[tuple[Scanner, bool], LoadingPlan] = {}
 
     def play(self, condition: Condition, plan: str, drive: str) -> dict[str, Any]:
         """One row: all loads in one condition, planned and driven in one way."""
@@ -198,11 +202,9 @@ class _Bench:
             told = self._after_every_scan(condition, trucks, random, timing)
         else:
             scan = condition.scanner.scan(self._pile, random)
-            told = _from(self._plan(scan, condition.scanner))
+            told = _from(self._plan(scan, condition.scanner, traced=plan == TRACED))
             if plan == REFEREED:
-                spots = [self._site.placed_receiver] * len(trucks)
-                foreseen = [one.plan for one in self._played(simulator, scan, told, spots, TOE)]
-                told = _from(jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *foreseen))
+                told = _from(self._foreseen(simulator, scan, told, TOE))
         made = self._played(simulator, self._pile, told, trucks, drive)
         return _summary(made) | timing.row()
 
@@ -247,10 +249,22 @@ class _Bench:
 
         return told
 
-    def _plan(self, scan: Pile, scanner: Scanner) -> LoadingPlan:
-        """The greedy plan for all loads, made once."""
-        if scanner not in self._once:
-            self._once[scanner] = wlplan.plan_loads(
+    def _foreseen(self, world: World, pile: Pile, told: Told, drive: str) -> LoadingPlan:
+        """The plan that comes of what is told, where a world is what happens."""
+        spots = [self._site.placed_receiver] * self._setup.loads
+        plans = [one.plan for one in self._played(world, pile, told, spots, drive)]
+        whole: LoadingPlan = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *plans)
+        return whole
+
+    def _plan(self, scan: Pile, scanner: Scanner, *, traced: bool) -> LoadingPlan:
+        """The plan for all loads, made once by greedy, or with the toe traced before each."""
+        key = scanner, traced
+        if key not in self._once and traced:
+            random = np.random.default_rng(self._seed)
+            told = self._after_every_scan(Condition(), [], random, _Timing([], []))
+            self._once[key] = self._foreseen(self._hybrid, scan, told, PLACE)
+        elif key not in self._once:
+            self._once[key] = wlplan.plan_loads(
                 self._hybrid,
                 scan,
                 loads=self._setup.loads,
@@ -259,7 +273,7 @@ class _Bench:
                 site=self._site,
                 seed=self._seed,
             ).plan
-        return self._once[scanner]
+        return self._once[key]
 
     def _trucks(self, condition: Condition, random: np.random.Generator) -> list[Receiver]:
         """Where the truck of each load stands: at its spot, or so far off it, and on no soil."""
@@ -345,7 +359,7 @@ def differences(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     names = list(dict.fromkeys(row["pile"] for row in rows))
     found = []
     for condition in dict.fromkeys(row["condition"] for row in rows):
-        for plan, drive in WAYS[:3]:
+        for plan, drive in OPEN:
             pairs = []
             for name in names:
                 anew = by_name[name, condition, ANEW, PLACE]
@@ -402,8 +416,10 @@ def draw(folder: Path) -> None:
     figure = new_figure(9.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(1.4, 1.0))
     conditions = list(dict.fromkeys(row["condition"] for row in result["differences"]))
-    styles = dict(zip(WAYS[:3], ((ORANGE, "o"), (BLUE, "o"), (FAINT, "s")), strict=True))
-    for shift, (way, (colour, mark)) in zip((-0.2, 0.0, 0.2), styles.items(), strict=True):
+    looks = ((ORANGE, "o"), (BLUE, "o"), (FAINT, "s"), (GREEN, "^"))
+    styles = dict(zip(OPEN, looks, strict=True))
+    shifts = (-0.24, -0.08, 0.08, 0.24)
+    for shift, (way, (colour, mark)) in zip(shifts, styles.items(), strict=True):
         of = [row for row in result["differences"] if (row["plan"], row["drive"]) == way]
         means = [row["cost"][0] for row in of]
         errors = [row["cost"][1] or 0.0 for row in of]
@@ -419,7 +435,7 @@ def draw(folder: Path) -> None:
         if row["condition"] == conditions[-1]:
             way = row["plan"], row["drive"]
             loads = np.arange(1, len(row["cost"]) + 1)
-            colour = styles[way][0] if way in styles else "black"
+            colour = styles[way][0] if way in styles else INK
             dash = "--" if way == (ANEW, TOE) else "-"
             cost = np.array(row["cost"]) / loads
             right.plot(loads, cost, dash, color=colour, lw=1.3, label=", ".join(way))

@@ -77,8 +77,9 @@ def test_what_is_missed_is_marked_and_filled() -> None:
     assert not seen[:10].any()
     missed = known & ~seen
     assert 0.04 < missed.mean() < 0.09
-    lines = [~seen.any(axis=axis) for axis in (0, 1)]
-    assert (lines[0].sum() == 3) or (lines[1][10:].sum() >= 2)
+    # Of the 80 lines along x or the 60 along y, a twentieth, beside those that were unseen before.
+    columns, lines = (int(np.sum(~seen.any(axis=axis))) for axis in (0, 1))
+    assert columns == 3 or lines - 10 >= 2
     assert np.isfinite(np.asarray(scan.height)).all()
     np.testing.assert_allclose(
         np.asarray(scan.height)[seen], np.asarray(pile.height)[seen], rtol=1e-6
@@ -89,7 +90,8 @@ def test_what_is_missed_is_marked_and_filled() -> None:
 
 
 def test_rows_are_made_once_and_anew_where_the_setup_is_another(tmp_path: Path) -> None:
-    path, made = tmp_path / "there" / "rows.jsonl", []
+    path = tmp_path / "there" / "rows.jsonl"
+    made: list[int] = []
 
     def make() -> dict[str, int]:
         made.append(len(made))
@@ -119,7 +121,7 @@ def test_pairs_are_of_the_same_pile_and_the_interval_is_students() -> None:
     rows = [
         row(name, plan, drive, cost * (change[name] if plan == closed_loop.ANEW else 1.0))
         for name, cost in once.items()
-        for plan, drive in closed_loop.WAYS[:4]
+        for plan, drive in closed_loop.WAYS[:5]
     ]
     for found in closed_loop.differences(rows):
         assert found["cost"] == pytest.approx([-5.0, 4.303 * 5.0 / math.sqrt(3.0)], rel=1e-3)
