@@ -213,6 +213,20 @@ def _rollouts(clock: Clock, inputs: Inputs, name: str) -> Rows:
         yield _a_second(found, "loads", count * inputs.sizes.loads) | {"batch": count}
 
 
+def _agreement(clock: Clock, inputs: Inputs, name: str) -> Rows:
+    """What one plan comes to there and on the processor: how far they are apart, as a part."""
+    del clock
+    if jax.default_backend() == "cpu":
+        return
+    plan = jax.tree.map(lambda leaf: leaf[0], inputs.plans(1))
+    case = wlplan.load_world(name), inputs.cone, plan
+    there = jax.device_get(rollout(*case).performance)
+    with jax.default_device(jax.devices("cpu")[0]):
+        here = jax.device_get(rollout(*jax.device_get(case)).performance)
+    apart = jax.tree.map(lambda a, b: float(np.max(abs(a - b) / abs(b))), there, here)
+    yield {"mass": apart.mass, "time": apart.time, "work": apart.work}
+
+
 def _gradients(clock: Clock, inputs: Inputs, name: str) -> Rows:
     """Costs of plans and their gradients, as the gradient planner has them."""
     world, pile = wlplan.load_world(name), inputs.cone
@@ -344,6 +358,7 @@ PARTS: dict[str, tuple[Callable[[Clock, Inputs, str], Rows], float]] = {
     "training": (_training, 1.0),
     "gradients": (_gradients, 2.0),
     "planning": (_planning, 4.0),
+    "agreement": (_agreement, 1.0),
 }
 """What is measured, by name, in this order, and shares of the time; rollouts in further worlds come
 last."""

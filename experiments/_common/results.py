@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 
+import wlplan
 from wlplan.dataset import Dataset, collect, fingerprint, open_dataset
 from wlplan.errors import InputError
 from wlplan.io import write_text_atomic
@@ -39,7 +40,8 @@ def conditions() -> dict[str, Any]:
         "device": f"{device.device_kind or device.platform}, {cores()} cores",
         "machine": platform.machine(),
         "python": platform.python_version(),
-        **{name: metadata.version(name) for name in ("wlplan", "jax", "jaxlib", "flax", "numpy")},
+        "wlplan": wlplan.__version__,
+        **{name: metadata.version(name) for name in ("jax", "jaxlib", "flax", "numpy")},
     }
 
 
