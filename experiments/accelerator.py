@@ -414,8 +414,8 @@ def draw(folder: Path) -> None:
     panel.set_yscale("log")
     panel.set_xlabel(f"rollouts of {result['loads']} loads in one call", fontsize=8)
     panel.set_ylabel("loads a second", fontsize=8)
-    device = result["conditions"]["device"]
-    panel.set_title(f"{device}; {result['devices']} of them", fontsize=8)
+    several = f"{result['devices']} × " if result["devices"] > 1 else ""
+    panel.set_title(several + result["conditions"]["device"], fontsize=8)
     panel.legend(frameon=False, fontsize=8)
     tidy(panel)
     write_bytes_atomic(folder / "accelerator.png", png_bytes(figure))
