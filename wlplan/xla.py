@@ -1,7 +1,7 @@
-"""Where XLA needs help: maps run in parallel on the cores, and arrays that are materialized.
+"""Where XLA needs help: maps over cores and devices, and arrays that are materialized.
 
 A CPU gains nothing from a batch of rollouts, which only takes longer to compile and waits for its
-slowest member; but each of its cores can run one.
+slowest member; but each of its cores can run one. Of several devices each takes a part of a batch.
 """
 
 from __future__ import annotations
@@ -16,15 +16,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
 from wlplan.types import PyTree
+
+# The axis of a mesh of devices along which rows lie.
+_ROWS = "rows"
 
 
 class ParallelMap:
     """A compiled `function(shared, row)`, mapped over rows in parallel.
 
-    On a CPU each core takes one row at a time, elsewhere the rows are one `vmap`.
+    On a CPU each core takes one row at a time. Elsewhere the rows are one `vmap`; of several
+    devices each has a part of it, and none waits for another before all are done.
 
     Args:
         function: Pure function of two pytrees: what all rows share, and one row.
@@ -32,7 +37,7 @@ class ParallelMap:
 
     def __init__(self, function: Callable[[Any, Any], Any]):
         self._one = jax.jit(function)
-        self._batch = jax.jit(jax.vmap(function, in_axes=(None, 0)))
+        self._function = function
         self._ran: set[Any] = set()
 
     def __call__(self, shared: Any, rows: Any) -> Any:
@@ -45,8 +50,8 @@ class ParallelMap:
         Returns:
             Pytree of the function's results, leaves with the same leading axis `n`.
         """
-        if jax.default_backend() != "cpu":
-            return self._batch(shared, rows)
+        if jax.default_backend() != "cpu" or jax.local_device_count() > 1:
+            return self._over_devices(shared, rows)
         count = len(jax.tree.leaves(rows)[0])
         members = [jax.tree.map(lambda leaf, k=k: leaf[k], rows) for k in range(count)]
         results = []
@@ -65,6 +70,30 @@ class ParallelMap:
         results += _threads().map(run, members)
         # By numpy: another number of rows would be compiled anew.
         return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *results)
+
+    def _over_devices(self, shared: Any, rows: Any) -> Any:
+        """A batch on each device; the last row again fills up what does not come out even."""
+        count, devices = len(jax.tree.leaves(rows)[0]), jax.local_device_count()
+        if spare := -count % devices:
+            which = np.minimum(np.arange(count + spare), count - 1)
+            rows = jax.tree.map(lambda leaf: jnp.asarray(leaf)[which], rows)
+        results = self._batch(shared, rows)
+        if spare:
+            results = jax.tree.map(lambda leaf: leaf[:count], results)
+        return results
+
+    @functools.cached_property
+    def _batch(self) -> Callable[[Any, Any], Any]:
+        mesh = Mesh(np.array(jax.local_devices()), (_ROWS,))
+        on_each = jax.shard_map(
+            jax.vmap(self._function, in_axes=(None, 0)),
+            mesh=mesh,
+            in_specs=(PartitionSpec(), PartitionSpec(_ROWS)),
+            out_specs=PartitionSpec(_ROWS),
+            # Loops begin with constants, which are the same on all devices, and end with rows.
+            check_vma=False,
+        )
+        return jax.jit(on_each)
 
 
 def materialize_if(values: PyTree, wanted: Bool[Array, ""], *, otherwise: float = 0.0) -> PyTree:

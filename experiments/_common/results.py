@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 
+import wlplan
 from wlplan.dataset import Dataset, collect, fingerprint, open_dataset
 from wlplan.errors import InputError
 from wlplan.io import write_text_atomic
@@ -28,6 +29,8 @@ DATA = Path("out") / "cycles.zarr"
 CYCLES, SMOKE_CYCLES = 10_800, 180
 # The models that experiments train, see `experiments._common.models`.
 MODELS = Path("out") / "models"
+# The rows of those that go on where they were cut short, see `experiments._common.rows`.
+ROWS = Path("out") / "rows"
 
 
 def conditions() -> dict[str, Any]:
@@ -37,7 +40,8 @@ def conditions() -> dict[str, Any]:
         "device": f"{device.device_kind or device.platform}, {cores()} cores",
         "machine": platform.machine(),
         "python": platform.python_version(),
-        **{name: metadata.version(name) for name in ("wlplan", "jax", "jaxlib", "flax", "numpy")},
+        "wlplan": wlplan.__version__,
+        **{name: metadata.version(name) for name in ("jax", "jaxlib", "flax", "numpy")},
     }
 
 
@@ -90,8 +94,9 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
 
     Args:
         name: Name of its module.
-        run: Function of the preset to the result; of a data set and of the folder of trained models
-            too if it has parameters `data` and `models`.
+        run: Function of the preset to the result; of a data set, of the folder of trained models,
+            of the file of rows and of the folder of results too if it has parameters `data`,
+            `models`, `rows` and `out`.
         draw: Draws the result that lies in a folder there.
     """
     needs = inspect.signature(run).parameters
@@ -117,6 +122,10 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
     if not options.draw:
         more: dict[str, Any] = {}
         smoke = options.preset == "smoke"
+        if "out" in needs:
+            more["out"] = options.out
+        if "rows" in needs:
+            more["rows"] = (options.out if smoke else ROWS) / f"{name}.jsonl"
         if "models" in needs:
             more["models"] = options.models or (options.out / MODELS.name if smoke else MODELS)
         if needs_data:
