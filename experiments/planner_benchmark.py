@@ -80,7 +80,7 @@ def _always(planner: Callable[[], Planner]) -> Callable[[int], Planner]:
 def _iterated(budget: int) -> Planner:
     """As many rounds as a budget has room for; one makes half a plan and plays it."""
     starts = 10 if budget > 10 else min(budget, 3)
-    return IteratedGreedy(starts=starts, rounds=int(1.7 * (budget - starts)))
+    return IteratedGreedy(starts=starts, rounds=int(1.4 * (budget - starts)))
 
 
 PLANNERS: dict[str, Callable[[int], Planner]] = {

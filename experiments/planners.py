@@ -1,4 +1,4 @@
-"""Nominal, greedy and gradient plans on the three kinds of seed pile, in model and simulator."""
+"""Plans of four planners on the three kinds of seed pile, in model and simulator."""
 
 from __future__ import annotations
 
@@ -14,10 +14,17 @@ import wlplan
 from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.plan import play
-from wlplan.planning.planners import Gradient, Greedy, Nominal
+from wlplan.planning.planners import Gradient, Greedy, IteratedGreedy, Nominal
+from wlplan.planning.proposals import Planner
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 
+_NAMES = {
+    "Nominal": "nominal",
+    "Greedy": "greedy",
+    "Gradient": "gradient",
+    "IteratedGreedy": "iterated greedy",
+}
 KINDS = ("conical", "triangular", "wedge")
 SLOPE_DEGREES, SEED, LOADS = 30.0, 1, 15
 
@@ -26,12 +33,13 @@ def run(preset: str) -> dict[str, Any]:
     """Plans with each planner in the low world and plays the plans in the simulator."""
     smoke = preset == "smoke"
     kinds, loads = (KINDS[:1], 2) if smoke else (KINDS, LOADS)
-    planners: tuple[Nominal | Greedy | Gradient, ...] = (Nominal(), Greedy(), Gradient())
+    planners: tuple[Planner, ...] = (Nominal(), Greedy(), Gradient(), IteratedGreedy())
     if smoke:
         greedy = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3)
         nominal = Nominal(actions=6, refine_steps=2, rows=2)
         few = Gradient(starts=2, iterations=2, candidates=3, start=greedy)
-        planners = (nominal, greedy, few)
+        iterated = IteratedGreedy(rounds=1, starts=1, greedy=greedy, candidates=2)
+        planners = (nominal, greedy, few, iterated)
     low, simulator = wlplan.load_world("low"), wlplan.load_world("simulator")
     rows = []
     for kind in kinds:
@@ -53,7 +61,7 @@ def run(preset: str) -> dict[str, Any]:
                 rows.append(
                     {
                         "pile": kind,
-                        "planner": type(planner).__name__.lower()
+                        "planner": _NAMES[type(planner).__name__]
                         + (" + referee" if referee is not None else ""),
                         "model": _summary(plan),
                         "simulator": _summary(simulated),
