@@ -37,7 +37,7 @@ def test_two_loads_are_planned_written_and_played_again(tmp_path: Path) -> None:
     assert names == ["plan.json", "plan.png", "report.html", "totals.png"]
 
     plan = json.loads((tmp_path / "out" / "plan.json").read_text())
-    assert (plan["world"], plan["planner"], plan["referee"]) == ("hybrid", "gradient", True)
+    assert (plan["world"], plan["planner"], plan["referee"]) == ("hybrid", "iterated_greedy", True)
     predicted, simulated = (plan["total"][part] for part in ("predicted", "simulated"))
     assert min(predicted["mass"], simulated["mass"]) > 6.0
     # The prediction holds up, or a note says of which load it does not.

@@ -14,11 +14,15 @@ from laws import assert_gradient
 import wlplan
 from wlplan.actions import squash, unsquash
 from wlplan.errors import InputError
+from wlplan.planning.amounts import Loads
+from wlplan.planning.job import judged, make_job, with_toe
 from wlplan.planning.loading import Loading
 from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.planners import Gradient, Greedy, Nominal
-from wlplan.planning.playing import PlanResult
+from wlplan.planning.planners.greedy import cost_of, plan_of
+from wlplan.planning.playing import PlanResult, outcomes
 from wlplan.planning.poses import distance_to_toe, pose_at, toe_of
+from wlplan.planning.watch import Watch
 from wlplan.terrain.excavation import excavate
 from wlplan.terrain.toe import TOE_RISE, toe_contour
 from wlplan.types import Action, Performance, Pile, Pose, action_vector
@@ -177,6 +181,53 @@ def test_a_referee_has_the_last_word_among_the_candidates() -> None:
     again = play(contrary, cone(), judged.plan, site=SITE)
     assert float(again.cost) == pytest.approx(float(judged.refereed.cost), rel=1e-5)
     assert float(judged.refereed.cost) != float(judged.cost)
+
+
+class Blind(Greedy):
+    """Greedy that is not shown the referee."""
+
+    plays_in_referee = False
+
+
+def test_greedy_makes_the_load_that_is_best_as_the_referee_plays_it() -> None:
+    """Of those that it would refine, as many as are at poses of their own."""
+
+    def fails_where_it_is_best(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+        after, performance = bowl_world(pile, pose, action)
+        part = 0.1 + 0.9 * jax.nn.sigmoid(4.0 * (-pose.y))
+        return after, performance.replace(mass=part * performance.mass)
+
+    options: dict[str, Any] = {"loads": 3, "contour": circle(), "site": SITE}
+    settings = dataclasses.asdict(GREEDY)
+    referee = wlplan.world(fails_where_it_is_best)
+    seeing, blind = (
+        plan_loads(
+            bowl_world, cone(), planner=kind(**settings), referee=referee, mend=False, **options
+        )
+        for kind in (Greedy, Blind)
+    )
+    assert seeing.refereed is not None
+    assert blind.refereed is not None
+    # The truck is in the north-west, where loads fail.
+    assert (np.asarray(blind.plan.pose.y) > 0.0).any()
+    assert (np.asarray(seeing.plan.pose.y) < 0.0).all()
+    assert seeing.refereed.cost < 0.9 * blind.refereed.cost
+
+
+def test_a_load_follows_on_the_pile_that_the_referee_leaves() -> None:
+    def takes_all(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+        """Digs as the planning world has it, and lowers all of the pile besides."""
+        after, performance = bowl_world(pile, pose, action)
+        return after.replace(height=0.8 * after.height), performance
+
+    job = with_toe(make_job(bowl_world, cone(), site=SITE, amount=Loads(2)), circle())
+    asked = job.replace(referee=takes_all)
+    made = GREEDY.grow(asked, [], 2, np.random.default_rng(0), Watch())
+    low = 0.8**2 * np.asarray(cone().height).max()
+    assert np.asarray(made[-1].standing.pile.height).max() <= low * (1.0 + 1e-6)
+    plan = jax.tree.map(lambda leaf: leaf[None], plan_of(asked, made, 2))
+    played = outcomes(judged(asked), plan)
+    np.testing.assert_allclose(cost_of(asked, made), played.cost[0], rtol=1e-4)
 
 
 def test_bad_requests_are_refused() -> None:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from wlplan.planning.job import Decisions, Job
+from wlplan.planning.job import Decisions, Job, judged
 from wlplan.planning.plan import choose
 from wlplan.planning.playing import PlanResult, outcomes
 from wlplan.planning.proposals import NothingWorthIt, Planner, Progress, Proposals
@@ -48,6 +48,11 @@ class Within:
     # Of each part: what the referee picked, as it played it.
     picked: list[PlanResult] = dataclasses.field(default_factory=list)
 
+    @property
+    def plays_in_referee(self) -> bool:
+        """Whether the planner is given the referee."""
+        return bool(getattr(self.planner, "plays_in_referee", False))
+
     def propose(
         self, job: Job, loads: int, *, seed: int, progress: Progress | None = None
     ) -> Proposals:
@@ -57,6 +62,7 @@ class Within:
             OverBudget: If there is none.
         """
         del progress
+        bare = job.replace(referee=None)
         budget = math.inf
         if self.ratio is not None:
             assert self.of_greedy is not None
@@ -81,7 +87,7 @@ class Within:
             if plans is None and watch.best is not None and watch.best.cost > -math.inf:
                 plans = jax.tree.map(lambda leaf: leaf[None], watch.best.plan)
             if plans is not None:
-                costs = np.asarray(outcomes(job, plans).cost, float)
+                costs = np.asarray(outcomes(judged(job), plans).cost, float)
                 found += [
                     (float(cost), jax.tree.map(lambda leaf, row=row: leaf[row], plans))
                     for row, cost in enumerate(costs)
@@ -99,7 +105,7 @@ class Within:
         self.rows += loads
         plans = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(plan for _, plan in found))
         if self.referee is not None:
-            picked = choose(job, Proposals(plans), referee=self.referee).refereed
+            picked = choose(bare, Proposals(plans), referee=self.referee).refereed
             assert picked is not None
             self.picked.append(picked)
         return Proposals(jax.tree.map(lambda leaf: leaf[:1], plans))

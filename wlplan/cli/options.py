@@ -279,7 +279,7 @@ world_option = click.option(
 planner_option = click.option(
     "--planner",
     type=NameOrReference("planner", planners.NAMES),
-    default="gradient",
+    default="iterated_greedy",
     show_default=True,
     help=f"Planner: {', '.join(planners.NAMES)}, or package.module:Name of one of your own.",
 )

@@ -41,6 +41,13 @@ class Job(struct.PyTreeNode):
     yard: Yard  # room to drive around the pile
     amount: Amount  # to be loaded
     toe: Toe | None = None  # to dig along; None where plans with poses of their own are played
+    # Who plays each load as it is planned, for planners that ask for it; None: the world itself.
+    referee: World | None = None
+
+
+def judged(job: Job) -> Job:
+    """The job in the world of its referee, if it has one."""
+    return job if job.referee is None else job.replace(world=job.referee, referee=None)
 
 
 @no_type_check

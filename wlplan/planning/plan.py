@@ -55,7 +55,7 @@ def plan_loads(
     loads: int | None = None,
     amount: Amount | None = None,
     objective: str | Objective | Mapping[str, Any] | Callable[..., Any] | None = None,
-    planner: str | Planner = "gradient",
+    planner: str | Planner = "iterated_greedy",
     site: Site | None = None,
     truck: str | None = None,
     seed: int = 0,
@@ -86,7 +86,8 @@ def plan_loads(
         referee: World that plays the planner's candidates, each dig at the toe of the pile as the
             referee has it by then, and picks the cheapest; the poses of the result are the ones
             it dug at. A candidate that costs more in `world` than the planner's limit, for the
-            gradient planner the greedy plan, is out. None: `world` picks, with its own poses.
+            gradient planner the greedy plan, is out. Planners of ours that go load by load plan
+            each load on the pile as the referee has it. None: `world` picks, with its own poses.
         mend: Whether loads that fail in the referee, though nothing of it was foreseen, are tried
             there with the actions of others, see `wlplan.planning.mending`; the limit does not
             hold for that.
@@ -145,7 +146,10 @@ def plan_loads(
                     price = _price(parts) if parts else price_of(of_part, seed, watch)
                     of_part = of_part.replace(amount=part[0].replace(price=price))
                 watch.best = None
-                proposals = chosen.propose(of_part, rows, seed=seed + len(parts), progress=watch)
+                asked = of_part
+                if getattr(chosen, "plays_in_referee", False):
+                    asked = of_part.replace(referee=checked)
+                proposals = chosen.propose(asked, rows, seed=seed + len(parts), progress=watch)
         except (InputError, NothingWorthIt):
             # Of what was planned already, nothing is lost.
             if not parts:

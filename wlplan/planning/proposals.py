@@ -31,7 +31,11 @@ class Proposals(NamedTuple):
 
 @runtime_checkable
 class Planner(Protocol):
-    """A planner: a value whose fields are its settings. Any object with this method is one."""
+    """A planner: a value whose fields are its settings. Any object with this method is one.
+
+    One that has an attribute `plays_in_referee` that is true is given the referee too, as
+    `job.referee`.
+    """
 
     def propose(
         self, job: Job, loads: int, *, seed: int, progress: Progress | None = None

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from wlplan.planning.amounts import Outlook
 from wlplan.planning.driving import room_of
-from wlplan.planning.job import Decisions, Job, Standing, decided
+from wlplan.planning.job import Decisions, Job, Standing, decided, judged
 from wlplan.planning.playing import Assessed, assess
 from wlplan.planning.poses import pose_at
 from wlplan.planning.search import Cusps
@@ -77,7 +77,9 @@ def advance(
     outlook: Outlook,
     score: Float[Array, ""] | float,
 ) -> Advanced:
-    """Makes a loading. The truck leaves when no further load would make it better.
+    """Makes a loading, in the world of the referee if there is one.
+
+    The truck leaves when no further load would make it better.
 
     Args:
         job: World, amount and toe.
@@ -87,7 +89,7 @@ def advance(
         score: What `score_of_next` has of it.
     """
     one = decided(job, standing, decisions)
-    after, performance = job.world(standing.pile, one.pose, one.action)
+    after, performance = judged(job).world(standing.pile, one.pose, one.action)
     amount, mass = job.amount, performance.mass
     stays = amount.step(standing.done, mass, jnp.zeros((), bool)).done
     step = amount.step(standing.done, mass, amount.should_leave(stays, outlook))

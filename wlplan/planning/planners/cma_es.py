@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,6 +27,8 @@ class CmaEs:
     pycma (Hansen, Akimoto and Baudis 2019, DOI 10.5281/zenodo.2559634) draws the plans and is told
     their costs. Trucks are those of the plan that it starts at.
     """
+
+    plays_in_referee: ClassVar[bool] = True  # the plan that it starts at
 
     # Plans drawn in an iteration, and iterations.
     population: int = 16
@@ -58,6 +61,7 @@ class CmaEs:
 
         watch = watching(progress)
         near, limit = start_of(self.start, job, loads, self.spread, seed=seed, watch=watch)
+        job = job.replace(referee=None)
         pool = Pool(job, watch, self.candidates)
         random = np.random.default_rng([seed, 1])
         strategy = cma.CMAEvolutionStrategy(

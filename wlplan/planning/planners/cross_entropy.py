@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -28,6 +29,8 @@ class CrossEntropy:
     Positions are circular on a closed toe: the elites' are averaged as steps from the mean, the
     short way around. Trucks are those of the plan that it starts at.
     """
+
+    plays_in_referee: ClassVar[bool] = True  # the plan that it starts at
 
     # Plans drawn in the first iteration, by how much fewer in each after it, and iterations.
     population: int = 64
@@ -63,6 +66,7 @@ class CrossEntropy:
         """
         watch = watching(progress)
         near, limit = start_of(self.start, job, loads, self.spread, seed=seed, watch=watch)
+        job = job.replace(referee=None)
         pool = Pool(job, watch, self.candidates)
         random = np.random.default_rng([seed, 1])
         mean = np.zeros((near.loads, PER_LOAD))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,8 @@ _GREEDY = Greedy()
 @dataclasses.dataclass(frozen=True)
 class Gradient:
     """Improves all loadings at once: plans of another planner, and perturbations of the first."""
+
+    plays_in_referee: ClassVar[bool] = True  # the plan that it starts at
 
     # Plans that are optimised side by side: those of the planner that it starts at, as many as it
     # hands over, and perturbations of the first.
@@ -64,6 +66,7 @@ class Gradient:
         check_has_gradient(job, "plan in a learned world, or use the greedy or the nominal planner")
         watch = watching(progress)
         plans = plans_to_start_at(self.start, job, loads, seed=seed, watch=watch)
+        job = job.replace(referee=None)
         length = contour_length(job)
         random = np.random.default_rng([seed, 1])
         shaken = (self._perturbed(_row(plans, 0), length, random) for _ in range(self.starts))

@@ -9,13 +9,16 @@ from typing import ClassVar, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from wlplan.planning.amounts import Loads, Outlook
-from wlplan.planning.job import Decisions, Job, Standing, beginning, padded, stacked
+from wlplan.planning.job import Decisions, Job, Standing, beginning, judged, padded, stacked
 from wlplan.planning.load_search import LoadSearch, Memory, Tried
 from wlplan.planning.proposals import NothingWorthIt, Progress, Proposals
-from wlplan.planning.stepping import advance
+from wlplan.planning.search import Cusps
+from wlplan.planning.stepping import advance, score_of_next
 from wlplan.planning.watch import Watch, watching
+from wlplan.xla import ParallelMap
 
 
 class Grown(NamedTuple):
@@ -33,9 +36,14 @@ class Greedy(LoadSearch):
 
     What a loading leaves to do is judged by what loads are like now: buckets to fill the truck
     with, or tonnes. In a world without a derivative nothing is refined.
+
+    Where there is a referee it plays the best few, and the one that is cheapest there is made, on
+    the pile as the referee leaves it: what the planning world does not see, such as a stall, is
+    avoided load by load.
     """
 
     stage: ClassVar[str] = "greedy"  # as progress has it
+    plays_in_referee: ClassVar[bool] = True
 
     @classmethod
     def by_trial(cls) -> Greedy:
@@ -74,12 +82,12 @@ class Greedy(LoadSearch):
         Raises:
             NothingWorthIt: If there is none at all.
         """
-        made = list(made)
+        made, bare = list(made), job.replace(referee=None)
         standing, memory = (
             (made[-1].standing, made[-1].memory) if made else (beginning(job), Memory())
         )
         while len(made) < loads and not bool(job.amount.is_done(standing.done)):
-            tried, memory = self.look(job, standing, random, watch, memory)
+            tried, memory = self.look(bare, standing, random, watch, memory)
             outlook = memory.outlook
             assert outlook is not None
             left = loads - len(made)
@@ -117,10 +125,16 @@ class Greedy(LoadSearch):
             watch: Told what it took.
         """
         del left
-        found = self.best(job, standing, tried, outlook, watch)
-        best = int(np.argmin(found.scores))
+        found = self.best(job.replace(referee=None), standing, tried, outlook, watch)
+        scores = found.scores
+        if job.referee is not None:
+            watch.spend(loading=len(scores))
+            loads = found.decisions, found.cusps
+            scores = np.asarray(_scores_as_played((judged(job), standing, outlook), loads))
+            scores = np.nan_to_num(scores, nan=np.inf)
+        best = int(np.argmin(scores))
         decision: Decisions = jax.tree.map(lambda leaf: leaf[best], found.decisions)
-        return decision, float(found.scores[best])
+        return decision, float(scores[best])
 
 
 def plan_of(job: Job, made: Sequence[Grown], loads: int) -> Decisions:
@@ -137,4 +151,14 @@ def cost_of(job: Job, made: Sequence[Grown]) -> float:
     return sum(one.cost for one in made) + float(job.amount.rest(made[-1].standing.done))
 
 
+def _score_as_played(
+    shared: tuple[Job, Standing, Outlook], load: tuple[Decisions, Cusps]
+) -> Float[Array, ""]:
+    """Score of a load by what the world of the job makes of it."""
+    job, standing, outlook = shared
+    decision, cusps = load
+    return score_of_next(job, standing, decision, outlook, cusps)
+
+
+_scores_as_played = ParallelMap(_score_as_played)
 _advance = jax.jit(advance)

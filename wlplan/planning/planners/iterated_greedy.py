@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import ClassVar
 
 import jax
 import numpy as np
 
-from wlplan.planning.job import Job
+from wlplan.planning.job import Job, judged
 from wlplan.planning.planners.greedy import Greedy, Grown, plan_of
 from wlplan.planning.population import Pool
 from wlplan.planning.proposals import Progress, Proposals
@@ -26,15 +27,17 @@ class IteratedGreedy:
     loads before a point that is drawn, earlier ones as often as later ones.
     """
 
+    plays_in_referee: ClassVar[bool] = True
+
     # How often loads are made again.
-    rounds: int = 10
+    rounds: int = 6
     # Greedy, and how many of its plans are made from nothing before that.
     greedy: Greedy = _GREEDY
-    starts: int = 3
+    starts: int = 2
     # Of how many plans, the best so far, one is drawn whose loads are made again.
     parents: int = 3
     # How many plans are handed on.
-    candidates: int = 13
+    candidates: int = 8
 
     @classmethod
     def by_trial(cls) -> IteratedGreedy:
@@ -50,7 +53,7 @@ class IteratedGreedy:
         """
         watch = watching(progress)
         random = np.random.default_rng(seed)
-        pool = Pool(job, watch, self.candidates)
+        pool = Pool(judged(job), watch, self.candidates)
         best: list[tuple[float, list[Grown]]] = []
         total = self.starts + self.rounds
         for number in range(total):

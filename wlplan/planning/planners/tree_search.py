@@ -96,7 +96,7 @@ class TreeSearch(Greedy):
         watch: Watch,
     ) -> tuple[Decisions, float]:
         """The first load of the cheapest row of loads."""
-        ended: list[_Child] = []
+        job, ended = job.replace(referee=None), list[_Child]()
         nodes = [_Node(standing, 0.0, float(_cost_of_later(job, standing.done, outlook)))]
         for level in range(min(self.depth, left)):
             children = self._children(job, nodes, tried, outlook, watch)
