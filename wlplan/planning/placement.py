@@ -75,9 +75,11 @@ def beside(site: Site, pile: Pile, contour: ToeContour | None = None) -> Site:
     check_soil(site.soil)
     check_machine(site.machine)
     if site.receiver is not None:
-        for _, truck in stands_of(site.receiver):
-            place = place_of(receiver_for(site.receiver, truck))
-            _check_inside(place, site.truck_area, site.machine, site.frame)
+        # Without an area its place may be a value under a trace.
+        if site.truck_area is not None:
+            for _, truck in stands_of(site.receiver):
+                place = place_of(receiver_for(site.receiver, truck))
+                _check_inside(place, site.truck_area, site.machine, site.frame)
         return site
     receiver = best_receiver(
         pile,

@@ -99,8 +99,8 @@ class Greedy(LoadSearch):
             standing = after
             made.append(Grown(decision.replace(truck=truck), standing, memory, float(cost)))
             if says:
-                watch(self.stage, len(made), loads, cost_of(job, made))
                 watch.keep(plan_of(job, made, loads), -math.inf)
+                watch(self.stage, len(made), loads, cost_of(job, made))
         if not made:
             raise NothingWorthIt
         return made
