@@ -40,6 +40,8 @@ class Within:
     of_greedy: float | None = None
     # Who is shown the best few plans, and picks; None: nobody.
     referee: World | None = None
+    # Whether the planner is given a referee, if it asks for one.
+    in_referee: bool = False
     # Of all parts of a job: cost in the planning world, and what was spent.
     predicted: float = 0.0
     spent: float = 0.0
@@ -51,7 +53,7 @@ class Within:
     @property
     def plays_in_referee(self) -> bool:
         """Whether the planner is given the referee."""
-        return bool(getattr(self.planner, "plays_in_referee", False))
+        return self.in_referee and bool(getattr(self.planner, "plays_in_referee", False))
 
     def propose(
         self, job: Job, loads: int, *, seed: int, progress: Progress | None = None

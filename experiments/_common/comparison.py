@@ -11,7 +11,7 @@ from scipy.stats import t as student
 
 _CONFIDENCE = 0.95
 # Those that do not look at more than the next load, or at nothing.
-_NOT_AHEAD = ("greedy", "nominal", "max load", "random search")
+_NOT_AHEAD = ("greedy", "greedy, in the simulator", "nominal", "max load", "random search")
 
 Key = tuple[str, str, str, int]
 
