@@ -334,7 +334,7 @@ def run(preset: str, rows: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
 def draw(folder: Path) -> None:
     """Gain of each planner against what it evaluates and against the time that takes."""
     table = json.loads((folder / "planner_benchmark.json").read_text())["planners"]
-    jobs = [job for job in JOBS if any(row["job"] == job for row in table)]
+    jobs = list(dict.fromkeys(row["job"] for row in table))
     figure = new_figure(2.4 * len(jobs) + 1.6, 4.8)
     panels = figure.subplots(2, len(jobs), sharey="col", squeeze=False)
     names = [name for name in dict.fromkeys(row["planner"] for row in table) if name != "greedy"]
