@@ -359,7 +359,9 @@ def draw(folder: Path) -> None:
                         color=colour,
                     )
             panel.axhline(0.0, color=FAINT, lw=0.8)
-            panel.set_xscale("log")
+            # Times are known of runs only in which nothing was compiled.
+            if any(row[measure] is not None for row in table if row["job"] == job):
+                panel.set_xscale("log")
             panel.set_yscale("symlog", linthresh=5.0)
             tidy(panel)
         column[0].set_title(job, fontsize=9)
