@@ -27,7 +27,7 @@ NAMES = sorted(
     if module.name not in OTHERS
 )
 # Whose full preset has not been run yet: `experiments/README.md` says so.
-NOT_RUN: set[str] = {"dem_trucks", "efforts", "planner_benchmark"}
+NOT_RUN: set[str] = {"dem_trucks", "planner_benchmark"}
 
 
 def test_there_are_experiments_and_each_can_run_and_draw() -> None:
