@@ -65,8 +65,6 @@ class LoadSearch:
     refined: int = 8
     refine_steps: int = 30
     refine_rate: float = 0.08
-    # Whether the ways of these are searched thoroughly before the best is chosen.
-    thorough: bool = False
     # Candidates that are evaluated at once: bounds the memory.
     batch: int = 256
 
@@ -202,10 +200,6 @@ class LoadSearch:
             steps=self.refine_steps,
             rate=self.refine_rate,
         )
-        if not self.thorough:
-            return Ranked(decisions, cusps, np.asarray(refined))
-        watch.spend(look=len(rows), way=len(rows))
-        cusps, refined = _with_best_ways((job, standing, outlook), decisions)
         return Ranked(decisions, cusps, np.asarray(refined))
 
     def _costs(
@@ -264,15 +258,6 @@ def _cusps_of_some(shared: tuple[Job, Pile], positions: Float[Array, " p"]) -> C
     return jax.vmap(lambda at: cusps_of_next(job, pile, at, jnp.zeros_like(at)))(positions)
 
 
-def _with_best_way(
-    shared: tuple[Job, Standing, Outlook], decisions: Decisions
-) -> tuple[Cusps, Float[Array, ""]]:
-    job, standing, outlook = shared
-    cusps = cusps_of_next(job, standing.pile, decisions.position, decisions.offset, thorough=True)
-    return cusps, score_of_next(job, standing, decisions, outlook, cusps)
-
-
-_with_best_ways = ParallelMap(_with_best_way)
 _costs_of_portions, _cusps_of_portions = ParallelMap(_costs_at_poses), ParallelMap(_cusps_of_some)
 
 

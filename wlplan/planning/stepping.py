@@ -97,11 +97,9 @@ def advance(
     return Advanced(Standing(after, step.done), standing.done.trucks, cost)
 
 
-def cusps_of_next(
-    job: Job, pile: Pile, position: Array, offset: Array, *, thorough: bool = False
-) -> Cusps:
-    """Cusps of good ways, or of the best, from where a loading would be, whatever the action."""
+def cusps_of_next(job: Job, pile: Pile, position: Array, offset: Array) -> Cusps:
+    """Cusps of good ways from where a loading would be, whatever the action."""
     assert job.toe is not None
     pose = pose_at(job.toe, pile, position, offset)
     room, receiver = room_of(job.yard, pile), job.site.placed_receiver
-    return cusps_to(pose, receiver, room, job.site.machine, thorough=thorough)
+    return cusps_to(pose, receiver, room, job.site.machine, thorough=False)

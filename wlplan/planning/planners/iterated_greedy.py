@@ -22,9 +22,9 @@ class IteratedGreedy:
     """Undoes the last loads of the best plan and makes them again with other trials.
 
     Which poses greedy tries is chance, and what it takes for a hundredth less decides what it finds
-    later: on one pile its plans differ by a few per cent. So it is worth more to make a plan again
-    than to make its loads better. Iterated greedy (Ruiz and Stutzle 2007) keeps what was good: the
-    loads before a point that is drawn, earlier ones as often as later ones.
+    later. So it is worth more to make a plan again than to make its loads better. Iterated greedy
+    (Ruiz and Stutzle 2007) keeps what was good: the loads before a point that is drawn, earlier
+    ones as often as later ones.
     """
 
     plays_in_referee: ClassVar[bool] = True
