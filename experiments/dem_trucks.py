@@ -1,26 +1,31 @@
-"""A truck that greedy and the best planner fill, each from its own spot, in discrete elements.
+"""A truck that greedy and the best planner fill, in discrete elements.
 
-Both plan in the hybrid world. The simulator and the discrete elements then play the same decisions,
-each dig at the toe of the pile as they have it by then.
+All plan in the hybrid world, the best planner load by load on the pile as the simulator has it. The
+simulator and the discrete elements then play the same decisions, each dig at the toe of the pile as
+they have it by then.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
 import wlplan
 from experiments._common.results import main
+from experiments._common.rows import Rows
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.job import Job
 from wlplan.planning.plan import choose
-from wlplan.planning.planners import Gradient, Greedy, IteratedGreedy
+from wlplan.planning.planners import Greedy, IteratedGreedy
 from wlplan.planning.proposals import Planner, Progress, Proposals
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
@@ -29,6 +34,17 @@ from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
 AMOUNT = wlplan.Trucks(1, 27.0)
 KINDS = ("conical", "triangular")
 SEED = 1
+ROWS = Path("out") / "dem_trucks.jsonl"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Case:
+    """How a plan is made."""
+
+    planner: Planner
+    truck: Literal["auto"] | None = None
+    # Whether it is planned load by load on the pile as the simulator has it.
+    in_referee: bool = False
 
 
 @dataclasses.dataclass
@@ -36,6 +52,7 @@ class _Kept:
     """A planner, and what it was asked and handed over."""
 
     planner: Planner
+    plays_in_referee: bool
     asked: list[tuple[Job, Proposals]] = dataclasses.field(default_factory=list)
 
     def propose(
@@ -45,41 +62,59 @@ class _Kept:
         proposals = self.planner.propose(job, loads, seed=seed, progress=progress)
         # The very best is the first of all that hand over several.
         best = Proposals(jax.tree.map(lambda leaf: leaf[:1], proposals.candidates))
-        self.asked.append((job, best))
+        self.asked.append((job.replace(referee=None), best))
         return best
 
 
 def run(preset: str) -> dict[str, Any]:
-    """Plans two jobs and plays each plan in three worlds; the smoke preset leaves out the third."""
+    """Plans jobs and plays each plan in three worlds; the smoke preset leaves out the third."""
     smoke = preset == "smoke"
     few = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3)
     amount = wlplan.Trucks(1, 5.0) if smoke else AMOUNT
-    best: Planner = few if smoke else Gradient(start=IteratedGreedy())
-    cases: dict[str, tuple[Planner, Any]] = {
-        "greedy, default spot": (few if smoke else Greedy(), None),
-        "best planner, its own spot": (best, None if smoke else "auto"),
+    greedy, best = (few, few) if smoke else (Greedy(), IteratedGreedy())
+    own: Literal["auto"] | None = None if smoke else "auto"
+    worlds = ("simulator",) if smoke else ("simulator", "discrete elements")
+    cases = {
+        "greedy, default spot": _Case(greedy),
+        "greedy, its own spot": _Case(greedy, truck=own),
+        "best planner, its own spot": _Case(best, truck=own, in_referee=True),
     }
-    hybrid = wlplan.load_world("hybrid")
-    referees = {"simulator": wlplan.load_world("simulator")}
-    if not smoke:
-        referees["discrete elements"] = wlplan.load_world("dem")
+    made_with = {"wlplan": wlplan.__version__, "amount": repr(amount), "cases": repr(cases)}
+    kept = None if smoke else Rows(ROWS, made_with)
     rows = []
-    for kind in KINDS[:1] if smoke else KINDS:
-        pile = wlplan.relax(wlplan.seed_pile(kind, slope=math.radians(30.0), seed=SEED))
-        for name, (planner, truck) in cases.items():
-            kept = _Kept(planner)
-            plan = wlplan.plan_loads(
-                hybrid, pile, amount=amount, planner=kept, truck=truck, seed=SEED
-            )
-            played = {"model": _summary(plan)}
-            ((job, proposals),) = kept.asked
-            for world, referee in referees.items():
-                result = choose(job, proposals, referee=referee).refereed
-                assert result is not None
-                played[world] = _summary(result)
-                print(json.dumps({"pile": kind, "plan": name, world: played[world]}), flush=True)
-            rows.append({"pile": kind, "plan": name, **played})
+    for kind, name in itertools.product(KINDS[:1] if smoke else KINDS, cases):
+        make = functools.partial(_played, kind, cases[name], amount, worlds)
+        played = make() if kept is None else kept.get(f"{kind}, {name}", make)
+        rows.append({"pile": kind, "plan": name, **played})
     return {"payload": float(amount.payload), "seed": SEED, "rows": rows}
+
+
+def _played(
+    kind: str, case: _Case, amount: wlplan.Trucks, worlds: Sequence[str]
+) -> dict[str, dict[str, Any]]:
+    """One plan, in the world that planned it and in others."""
+    pile = wlplan.relax(wlplan.seed_pile(kind, slope=math.radians(30.0), seed=SEED))
+    simulator = wlplan.load_world("simulator")
+    kept = _Kept(case.planner, case.in_referee)
+    plan = wlplan.plan_loads(
+        wlplan.load_world("hybrid"),
+        pile,
+        amount=amount,
+        planner=kept,
+        truck=case.truck,
+        seed=SEED,
+        referee=simulator if case.in_referee else None,
+        mend=False,
+    )
+    played = {"model": _summary(plan)}
+    ((job, proposals),) = kept.asked
+    for name in worlds:
+        world = simulator if name == "simulator" else wlplan.load_world("dem")
+        result = choose(job, proposals, referee=world, mend=False).refereed
+        assert result is not None
+        played[name] = _summary(result)
+        print(json.dumps({name: played[name]}), flush=True)
+    return played
 
 
 def _summary(played: wlplan.PlanResult) -> dict[str, Any]:

@@ -24,8 +24,15 @@ import numpy as np
 
 import wlplan
 from experiments._common.budgets import OverBudget, Within
-from experiments._common.comparison import best_plans, by_planner, looking_ahead
-from experiments._common.instances import JOBS, PILES, SITES, SMOKE_JOB, Instance
+from experiments._common.comparison import (
+    IN_REFEREE,
+    Case,
+    best_plans,
+    by_planner,
+    looking_ahead,
+    steps,
+)
+from experiments._common.instances import EACH, JOBS, PILES, SITES, SMOKE_JOB, Instance
 from experiments._common.results import PRESETS, RESULTS, write_result
 from wlplan.io import write_bytes_atomic, write_text_atomic
 from wlplan.planning.amounts import Made, typical_load
@@ -43,7 +50,7 @@ from wlplan.planning.planners import (
 )
 from wlplan.planning.proposals import Planner
 from wlplan.planning.truck_search import best_place
-from wlplan.planning.watch import Watch
+from wlplan.planning.watch import EFFORTS, Watch
 from wlplan.plugins import load_object
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
@@ -53,8 +60,6 @@ ROWS = Path("out") / "planner_benchmark"
 # The best plan known of each instance, beside the results.
 BEST = "planner_benchmark_best.json"
 BUDGETS, SEEDS = (1, 10, 100), (0, 1, 2)
-IN_REFEREE = ", in the simulator"
-"""Added to the name of planners that plan each load on the pile as the simulator has it."""
 # What is run first, see `_rank`: planners, jobs and sites.
 _PLANNERS = {"greedy": 0, f"greedy{IN_REFEREE}": 0, f"iterated greedy{IN_REFEREE}": 0}
 _PLACES = {
@@ -63,11 +68,24 @@ _PLACES = {
     ("15 loads", "walls"): 1,
     ("trucks", "fixed truck"): 0,
     ("trucks", "free truck"): 0,
+    ("trucks", "a place for each"): 0,
     ("trucks", "walls, free truck"): 1,
     ("tonnes", "fixed truck"): 1,
     ("empty", "fixed truck"): 1,
     ("50 loads", "fixed truck"): 2,
 }
+BASES = (("greedy", 1), (f"greedy{IN_REFEREE}", 1))
+STEPS = (
+    Case("fixed truck", "greedy", 1),
+    Case("fixed truck", f"greedy{IN_REFEREE}", 1),
+    Case("fixed truck", f"iterated greedy{IN_REFEREE}", 10),
+    Case("free truck", "greedy", 1),
+    Case("free truck", f"greedy{IN_REFEREE}", 1),
+    Case("free truck", f"iterated greedy{IN_REFEREE}", 10),
+    Case("a place for each", f"greedy{IN_REFEREE}", 1),
+    Case("a place for each", f"iterated greedy{IN_REFEREE}", 10),
+)
+"""What a user may add to greedy with a fixed truck, one after another."""
 # A cycle of filling that takes longer than this has stalled [s].
 _STALL = 18.0
 # So little compiling does not show in the time of a run [s].
@@ -133,6 +151,7 @@ def runs(preset: str, planners: Sequence[str]) -> list[Run]:
     found = [
         Run(Instance(pile, job, site), planner, budget, seed)
         for pile, job, site, planner, budget, seed in places
+        if job == "trucks" or site != EACH
     ]
     return sorted(found, key=_rank)
 
@@ -180,6 +199,16 @@ def place_truck(instance: Instance, seed: int, folder: Path) -> Receiver | None:
     return Receiver(*(jnp.asarray(v, pile.height.dtype) for v in json.loads(path.read_text())))
 
 
+def made_with(run: Run, planner: Planner) -> dict[str, str]:
+    """What a row hangs on; one that was made with anything else is made anew."""
+    return {
+        "wlplan": wlplan.__version__,
+        "planner": repr(planner),
+        "amount": repr(run.instance.amount),
+        "efforts": json.dumps(EFFORTS),
+    }
+
+
 def play_run(
     run: Run, planner: Planner, of_greedy: float | None, receiver: Receiver | None = None
 ) -> dict[str, Any]:
@@ -201,7 +230,7 @@ def play_run(
     clock, processor = time.perf_counter(), time.process_time()
     _compiled.seconds = 0.0
     row: dict[str, Any] = {**dataclasses.asdict(run.instance), "planner": run.planner}
-    row |= {"budget": run.budget, "seed": run.seed}
+    row |= {"budget": run.budget, "seed": run.seed, "made_with": made_with(run, planner)}
     hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
     ratio = None if of_greedy is None else float(run.budget)
     in_referee = run.planner.endswith(IN_REFEREE)
@@ -213,6 +242,7 @@ def play_run(
             amount=run.instance.amount,
             site=site,
             planner=within,
+            truck="each" if run.instance.site == EACH else None,
             seed=run.seed,
             referee=simulator,
             mend=False,
@@ -234,7 +264,7 @@ def play_run(
         "poses": np.stack(jax.tree.leaves(result.plan.pose), axis=-1).round(4).tolist(),
         "actions": np.stack(jax.tree.leaves(result.plan.action), axis=-1).round(5).tolist(),
         "trucks": None if result.plan.truck is None else np.asarray(result.plan.truck).tolist(),
-        "receiver": [round(float(v), 4) for v in jax.tree.leaves(result.receiver)],
+        "receiver": [np.round(v, 4).tolist() for v in jax.tree.leaves(result.receiver)],
     }
     return row
 
@@ -286,20 +316,29 @@ def work(
         until: When no further run is begun, as `time.monotonic` has it.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    pile = None
     for number, run in enumerate(todo):
         if time.monotonic() > until:
             return
-        if (folder / f"{run.name}.json").exists():
+        # Maps of other extents have programs of their own, which would add up to many gigabytes.
+        if run.instance.pile != pile:
+            jax.clear_caches()
+            pile = run.instance.pile
+        planner = planners[run.planner](run.budget)
+        if (row := _read(folder / f"{run.name}.json")) and row["made_with"] == made_with(
+            run, planner
+        ):
             continue
         of_greedy = None
-        if (run.planner, run.budget) != ("greedy", 1):
+        # What greedy takes is the unit, in the simulator too: there it takes a little more.
+        if (run.planner, run.budget) not in BASES:
             base = dataclasses.replace(run, planner="greedy", budget=1)
             work([base], folder, planners, until)
             if (row := _read(folder / f"{base.name}.json")) is None:
                 return
             of_greedy = row["spent"] / row["rows"]
         receiver = place_truck(run.instance, run.seed, folder / "places")
-        row = play_run(run, planners[run.planner](run.budget), of_greedy, receiver)
+        row = play_run(run, planner, of_greedy, receiver)
         write_text_atomic(folder / f"{run.name}.json", json.dumps(row) + "\n")
         said = {name: value for name, value in row.items() if name != "plan"}
         print(f"{number + 1}/{len(todo)} {json.dumps(said)}", flush=True)
@@ -325,6 +364,7 @@ def run(preset: str, rows: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
         "without_a_plan": sorted(
             {f"{row['planner']} at {row['budget']}" for row in rows if row["plan"] is None}
         ),
+        "steps": steps(compared, STEPS),
         "looking_ahead": looking_ahead(compared),
         "planners": by_planner(compared),
         "rows": [{k: v for k, v in row.items() if k != "plan"} for row in compared],
@@ -343,7 +383,7 @@ def draw(folder: Path) -> None:
         for k, name in enumerate(names)
     }
     for column, job in zip(panels.T, jobs, strict=True):
-        for panel, measure in zip(column, ("spent", "processor"), strict=True):
+        for panel, measure in zip(column, ("spent", "search_processor"), strict=True):
             for name in names:
                 of = [row for row in table if (row["job"], row["planner"]) == (job, name)]
                 of = sorted(of, key=lambda row: (row["site"], row["budget"]))
@@ -405,7 +445,10 @@ def main() -> None:
                 if all(word in run.name for word in options.only)
             ]
             shown = SMOKE if options.preset == "smoke" else planners
-            work(todo[part - 1 :: parts], rows_in, shown, until)
+            # All of an instance go to one machine, which then has what they are compared with.
+            places = list(dict.fromkeys((run.instance, run.seed) for run in todo))
+            mine = set(places[part - 1 :: parts])
+            work([r for r in todo if (r.instance, r.seed) in mine], rows_in, shown, until)
         rows = [json.loads(path.read_text()) for path in sorted(rows_in.glob("*.json"))]
         best = options.out / BEST
         known = json.loads(best.read_text()) if best.exists() else []

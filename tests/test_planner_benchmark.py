@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from wlplan.planning.amounts import Loads
 from wlplan.planning.job import Job, make_job, with_toe
 from wlplan.planning.planners import Greedy, RandomSearch
 from wlplan.planning.playing import outcomes
+from wlplan.planning.proposals import Planner
 from wlplan.planning.watch import Watch
 
 GREEDY = Greedy(poses_per_metre=0.5, actions=12, refined=4, refine_steps=20)
@@ -69,19 +71,51 @@ def test_pairs_are_of_one_instance_and_seed() -> None:
         row("cone", "cma-es", 10, 2, 1.0),
         row("cone", "cma-es", 1, 0, 1.0),
     ]
-    found = comparison.gains(rows, "cma-es", 10)
+    found = comparison.gains(
+        rows, comparison.Case("walls", "cma-es", 10), comparison.Case("walls", "greedy", 1)
+    )
     assert [key[-1] for key, _ in found] == [0, 1]
     np.testing.assert_allclose([one["cost"] for _, one in found], [2.0, -2.5])
     np.testing.assert_allclose([one["seconds_a_tonne"] for _, one in found], 0.0)
 
 
+def test_steps_are_of_piles_that_have_all_of_them() -> None:
+    first, second = comparison.Case("walls", "greedy", 1), comparison.Case("walls", "x", 10)
+    rows = [
+        row("cone", "greedy", 1, 0, 50.0),
+        row("cone", "x", 10, 0, 45.0),
+        row("ridge", "greedy", 1, 0, 10.0),
+    ]
+    found = comparison.steps(rows, (first, second, comparison.Case("walls", "y", 10)))
+    assert [(one["planner"], one["pairs"]) for one in found] == [("greedy", 1), ("x", 1)]
+    assert [one["cost"]["mean"] for one in found] == pytest.approx([0.0, 10.0])
+    assert comparison.steps(rows, (comparison.Case("walls", "y", 10), first)) == []
+
+
+def test_looking_ahead_is_beside_greedy_that_has_as_much() -> None:
+    marked = comparison.IN_REFEREE
+    rows = [
+        row("cone", "greedy", 1, 0, 50.0),
+        row("cone", f"greedy{marked}", 1, 0, 45.0),
+        row("cone", "tree", 10, 0, 49.0),
+        row("cone", "nominal", 10, 0, 1.0),
+        row("cone", f"iterated{marked}", 10, 0, 36.0),
+    ]
+    found = comparison.looking_ahead(rows)
+    assert [(one["planner"], one["base"]) for one in found] == [
+        ("tree", "greedy"),
+        (f"iterated{marked}", f"greedy{marked}"),
+    ]
+    assert [one["cost"]["mean"] for one in found] == pytest.approx([2.0, 20.0])
+
+
 def test_an_interval_is_over_piles() -> None:
     """Student's interval of the means 1, 2 and 6, whatever the number of seeds."""
     of = [
-        (("a", "", "", 0), {"cost": 0.0}),
-        (("a", "", "", 1), {"cost": 2.0}),
-        (("b", "", "", 0), {"cost": 2.0}),
-        (("c", "", "", 0), {"cost": 6.0}),
+        (("a", "", 0), {"cost": 0.0}),
+        (("a", "", 1), {"cost": 2.0}),
+        (("b", "", 0), {"cost": 2.0}),
+        (("c", "", 0), {"cost": 6.0}),
     ]
     found = comparison.interval(of, "cost")
     assert found["piles"] == 3
@@ -113,12 +147,20 @@ def test_shards_share_the_runs_out() -> None:
     assert runs[0].planner == "greedy"
 
 
-def test_what_was_run_is_not_run_again(tmp_path: Path) -> None:
+def test_what_was_run_is_run_again_only_with_other_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (run,) = [one for one in benchmark.runs("smoke", ("greedy",))]
     place = tmp_path / f"{run.name}.json"
-    place.write_text(json.dumps({"kept": True}))
-    benchmark.work([run], tmp_path, {}, time.monotonic() + 60.0)
-    assert json.loads(place.read_text()) == {"kept": True}
+    row = {"kept": True, "made_with": benchmark.made_with(run, GREEDY)}
+    place.write_text(json.dumps(row))
+    of: dict[str, Callable[[int], Planner]] = {run.planner: lambda budget: GREEDY}
+    benchmark.work([run], tmp_path, of, time.monotonic() + 60.0)
+    assert json.loads(place.read_text()) == row
+    other: dict[str, Callable[[int], Planner]] = {run.planner: lambda budget: RANDOM}
+    monkeypatch.setattr(benchmark, "play_run", lambda *_: {"anew": True})
+    benchmark.work([run], tmp_path, other, time.monotonic() + 60.0)
+    assert json.loads(place.read_text()) == {"anew": True}
 
 
 @pytest.mark.parametrize("name", ["prism 0", "cone", "bundled"])

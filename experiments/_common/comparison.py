@@ -5,47 +5,63 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from scipy.stats import t as student
 
+IN_REFEREE = ", in the simulator"
+"""Added to the name of planners that plan each load on the pile as the simulator has it."""
 _CONFIDENCE = 0.95
 # Those that do not look at more than the next load, or at nothing.
-_NOT_AHEAD = ("greedy", "greedy, in the simulator", "nominal", "max load", "random search")
+_NOT_AHEAD = ("greedy", f"greedy{IN_REFEREE}", "nominal", "max load", "random search")
 
-Key = tuple[str, str, str, int]
+Key = tuple[str, str, int]
+"""Pile, job and seed."""
+
+
+class Case(NamedTuple):
+    """How runs were made."""
+
+    site: str
+    planner: str
+    budget: int  # in times what greedy spends
+
+
+def _case(row: dict[str, Any]) -> Case:
+    return Case(row["site"], row["planner"], row["budget"])
 
 
 def _key(row: dict[str, Any]) -> Key:
-    return row["pile"], row["job"], row["site"], row["seed"]
+    return row["pile"], row["job"], row["seed"]
 
 
 def gains(
-    rows: Sequence[dict[str, Any]], planner: str, budget: int
+    rows: Sequence[dict[str, Any]], case: Case, base: Case
 ) -> list[tuple[Key, dict[str, float]]]:
-    """What a planner is better than greedy by, on the same instance and seed [%].
+    """What a case is better than another by, on the same pile, job and seed [%].
 
     Args:
         rows: All of them.
-        planner: Its name.
-        budget: Its budget; greedy has its own, 1.
+        case: What is compared.
+        base: With what.
     """
-    base = {_key(row): row for row in rows if (row["planner"], row["budget"]) == ("greedy", 1)}
+    of_base = {_key(row): row for row in rows if _case(row) == base}
     found = []
     for row in rows:
-        if (row["planner"], row["budget"]) != (planner, budget) or _key(row) not in base:
+        if _case(row) != case or _key(row) not in of_base:
             continue
-        greedy = base[_key(row)]
+        other = of_base[_key(row)]
         found.append(
             (
                 _key(row),
                 {
-                    "predicted": _less(row["predicted"], greedy["predicted"]),
-                    "cost": _less(row["simulator"]["cost"], greedy["simulator"]["cost"]),
-                    "picked": _less(_picked(row), _picked(greedy)),
-                    "seconds_a_tonne": _less(*(_a_tonne(r, "time") for r in (row, greedy))),
-                    "work_a_tonne": _less(*(_a_tonne(r, "work") for r in (row, greedy))),
-                    "loads": float(row["simulator"]["loads"] - greedy["simulator"]["loads"]),
+                    "predicted": _less(row["predicted"], other["predicted"]),
+                    "cost": _less(row["simulator"]["cost"], other["simulator"]["cost"]),
+                    "picked": _less(_picked(row), _picked(other)),
+                    "seconds": _less(row["simulator"]["time"], other["simulator"]["time"]),
+                    "seconds_a_tonne": _less(*(_a_tonne(r, "time") for r in (row, other))),
+                    "work_a_tonne": _less(*(_a_tonne(r, "work") for r in (row, other))),
+                    "loads": float(row["simulator"]["loads"] - other["simulator"]["loads"]),
                 },
             )
         )
@@ -84,48 +100,83 @@ def interval(of: Sequence[tuple[Key, dict[str, float]]], name: str) -> dict[str,
     return {"mean": mean, "half": None if math.isnan(half) else half, "piles": len(means)}
 
 
+def _intervals(of: Sequence[tuple[Key, dict[str, float]]]) -> dict[str, Any]:
+    return {"pairs": len(of), **{name: interval(of, name) for name in of[0][1]}}
+
+
 def by_planner(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Every planner at every budget beside greedy, job by job and site by site."""
     table = []
-    seen = dict.fromkeys((row["job"], row["site"], row["planner"], row["budget"]) for row in rows)
-    for job, site, planner, budget in sorted(seen):
-        here = [row for row in rows if (row["job"], row["site"]) == (job, site)]
-        found = gains(here, planner, budget)
+    for job, case in sorted({(row["job"], _case(row)) for row in rows}):
+        here = [row for row in rows if row["job"] == job]
+        found = gains(here, case, Case(case.site, "greedy", 1))
         if not found:
             continue
-        own = [row for row in here if (row["planner"], row["budget"]) == (planner, budget)]
-        measures = {name: interval(found, name) for name in found[0][1]}
+        own = [row for row in here if _case(row) == case]
         of: dict[str, float | None] = {
             "spent": statistics.median(float(row["spent"]) for row in own)
         }
         # Times tell something where nothing was compiled.
         warm = [row for row in own if not row["compiled"]]
         for name in ("seconds", "processor"):
-            of[name] = statistics.median(float(r[name]) for r in warm) if warm else None
-        head = {"job": job, "site": site, "planner": planner, "budget": budget}
-        table.append({**head, "pairs": len(found), **of, **measures})
+            of[f"search_{name}"] = statistics.median(float(r[name]) for r in warm) if warm else None
+        table.append({"job": job, **case._asdict(), **of, **_intervals(found)})
     return table
 
 
 def looking_ahead(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What the best of the planners that look ahead is better than greedy by, job by job.
+    """What planners that look ahead are better by than greedy, job by job and site by site.
 
-    The best is chosen by what it foresees, as a user would, and not by how it was played.
+    Once in the model alone, and once with the simulator to plan in as well, where greedy has it
+    too. Of those in the model alone the best is taken, chosen by what it foresees, as a user would,
+    and not by how it was played.
     """
     table = []
     places = dict.fromkeys((row["job"], row["site"], row["budget"]) for row in rows)
     for job, site, budget in sorted(places):
-        here = [row for row in rows if (row["job"], row["site"]) == (job, site)]
-        ahead = dict.fromkeys(row["planner"] for row in here if row["planner"] not in _NOT_AHEAD)
-        found = {planner: gains(here, planner, budget) for planner in ahead}
-        found = {planner: one for planner, one in found.items() if one}
-        if not found:
+        here = [row for row in rows if row["job"] == job]
+        of_place = [row for row in here if (row["site"], row["budget"]) == (site, budget)]
+        ahead = dict.fromkeys(r["planner"] for r in of_place if r["planner"] not in _NOT_AHEAD)
+        for marked in (False, True):
+            base = Case(site, f"greedy{IN_REFEREE}" if marked else "greedy", 1)
+            measure = "cost" if marked else "predicted"
+            found = {
+                planner: gains(here, Case(site, planner, budget), base)
+                for planner in ahead
+                if planner.endswith(IN_REFEREE) == marked
+            }
+            means = {
+                planner: interval(one, measure)["mean"] for planner, one in found.items() if one
+            }
+            if means:
+                best = max(means, key=lambda planner: means[planner])
+                head = {"job": job, **Case(site, best, budget)._asdict()}
+                table.append({**head, "base": base.planner, **_intervals(found[best])})
+    return table
+
+
+def steps(rows: Sequence[dict[str, Any]], cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """What each case is better by than the first, job by job, on the piles that have all of them.
+
+    Args:
+        rows: All of them.
+        cases: One after another; those that a job has no rows of are left out.
+    """
+    table = []
+    for job in dict.fromkeys(row["job"] for row in rows):
+        here = [row for row in rows if row["job"] == job]
+        known = [case for case in cases if any(_case(row) == case for row in here)]
+        if not known or known[0] != cases[0]:
             continue
-        means = {planner: interval(one, "predicted")["mean"] for planner, one in found.items()}
-        best = max(means, key=lambda planner: means[planner])
-        measures = {name: interval(found[best], name) for name in found[best][0][1]}
-        head = {"job": job, "site": site, "budget": budget, "planner": best}
-        table.append({**head, "pairs": len(found[best]), **measures})
+        whole = set.intersection(
+            *({_key(row) for row in here if _case(row) == case} for case in known)
+        )
+        here = [row for row in here if _key(row) in whole]
+        if whole:
+            table += [
+                {"job": job, **case._asdict(), **_intervals(gains(here, case, cases[0]))}
+                for case in known
+            ]
     return table
 
 

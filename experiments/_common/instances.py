@@ -29,8 +29,10 @@ JOBS: dict[str, Amount] = {
     "empty": wlplan.Empty(),
 }
 SMOKE_JOB = "2 loads"
-SITES = ("fixed truck", "free truck", "walls", "walls, free truck")
-"""The truck at a place that is given, or where the planner wants it; with walls around or none."""
+EACH = "a place for each"
+SITES = ("fixed truck", "free truck", EACH, "walls", "walls, free truck")
+"""The truck at a place that is given, or where the planner wants it, or each truck of `Trucks`
+where it wants that one; with walls around or none."""
 
 _SMOKE: dict[str, Amount] = {SMOKE_JOB: wlplan.Loads(2)}
 
