@@ -98,9 +98,8 @@ def _always(planner: Callable[[], Planner]) -> Callable[[int], Planner]:
 
 
 def _iterated(budget: int) -> Planner:
-    """As many rounds as a budget has room for; one makes half a plan and plays it."""
-    starts = 10 if budget > 10 else min(budget, 3)
-    return IteratedGreedy(starts=starts, rounds=int(1.4 * (budget - starts)))
+    """As many rounds as the budget has room for, which ends them; one makes half a plan."""
+    return IteratedGreedy(starts=min(budget, 3), rounds=10 * budget)
 
 
 PLANNERS: dict[str, Callable[[int], Planner]] = {

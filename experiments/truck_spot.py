@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import time
@@ -14,8 +15,9 @@ import numpy as np
 import wlplan
 from experiments._common.joint import refined
 from experiments._common.results import main
+from experiments._common.rows import Rows
 from wlplan.io import bundled_pile_path, write_bytes_atomic
-from wlplan.planning.amounts import Made, typical_load
+from wlplan.planning.amounts import Amount, Made, typical_load
 from wlplan.planning.job import make_job, with_toe
 from wlplan.planning.placement import not_for_trucks, truck_stands_on
 from wlplan.planning.plan import choose, play
@@ -24,7 +26,7 @@ from wlplan.planning.proposals import Proposals
 from wlplan.planning.spots import at_receiver
 from wlplan.planning.watch import Watch
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.style import BLUE, FAINT, GREEN, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, tidy
 from wlplan.site.site import Site
 from wlplan.types import Pile
 
@@ -33,9 +35,18 @@ SLOPE_DEGREES, SEEDS = 30.0, (1, 2, 3)
 TRUCKS, PAYLOAD = 2, 24.0
 # Enough trucks that the pile changes, on some of the piles.
 MANY_TRUCKS, MANY_ON = 4, ("bundled", "conical 1", "triangular 2")
-KINDS = ("default", "auto", "auto, refined", "each")
-# Steps of the descent of place and digs together.
-STEPS = 16
+KINDS = ("default", "auto", "auto, refined", "auto, one by one", "each")
+# Steps of the descent of place and digs together, and where it is made.
+STEPS, REFINED_ON = 16, ("conical 1", "triangular 2")
+ROWS = Path("out") / "truck_spot.jsonl"
+
+
+class _OneByOne(wlplan.Trucks):
+    """Trucks that are planned one after another, and not some of them together."""
+
+    def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
+        """The next truck."""
+        return self.next_truck(made, typical)
 
 
 def piles(preset: str) -> dict[str, Pile]:
@@ -54,12 +65,20 @@ def _seed_pile(kind: str, seed: int) -> Pile:
 
 def run(preset: str) -> dict[str, Any]:
     """Greedy plans in the hybrid world with trucks here and there, played in the simulator."""
+    smoke = preset == "smoke"
+    planner = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3) if smoke else Greedy()
+    asked: list[tuple[str, str, int]] = []
+    for name in piles(preset):
+        kinds = KINDS[:3] if smoke or name in REFINED_ON else KINDS[:2]
+        asked += [(name, kind, TRUCKS) for kind in kinds]
+        if smoke or name in MANY_ON:
+            asked += [(name, kind, MANY_TRUCKS) for kind in ("auto", "auto, one by one", "each")]
+    made_with = {"wlplan": wlplan.__version__, "planner": repr(planner), "payload": PAYLOAD}
+    kept = None if smoke else Rows(ROWS, made_with)
     rows = []
-    for name, pile in piles(preset).items():
-        kinds = KINDS[:3]
-        rows += [one(name, pile, kind, TRUCKS, preset) for kind in kinds]
-        if preset == "smoke" or name in MANY_ON:
-            rows += [one(name, pile, kind, MANY_TRUCKS, preset) for kind in ("auto", "each")]
+    for name, kind, trucks in asked:
+        make = functools.partial(one, name, piles(preset)[name], kind, trucks, preset)
+        rows.append(make() if kept is None else kept.get(f"{name}, {kind}, {trucks}", make))
     return {"payload": PAYLOAD, "planner": "greedy", "rows": rows}
 
 
@@ -81,6 +100,9 @@ def one(name: str, pile: Pile, kind: str, trucks: int, preset: str) -> dict[str,
     begun = time.perf_counter()
     truck = {"default": None, "each": "each"}.get(kind, "auto")
     plan = wlplan.plan_loads(hybrid, pile, amount=amount, planner=planner, truck=truck)
+    if kind == "auto, one by one":
+        there, one_by_one = Site(receiver=plan.receiver), _OneByOne(amount.count, amount.payload)
+        plan = wlplan.plan_loads(hybrid, pile, amount=one_by_one, planner=planner, site=there)
     if kind == "auto, refined":
         plan = _refined(hybrid, pile, amount, planner, plan, steps)
     site = Site(receiver=plan.receiver)
@@ -147,7 +169,7 @@ def draw(folder: Path) -> None:
     rows = json.loads((folder / "truck_spot.json").read_text())["rows"]
     figure = new_figure(9.0, 3.4)
     left, right = figure.subplots(1, 2, width_ratios=(3.0, 1.3), sharey=True)
-    colours = dict(zip(KINDS, (FAINT, BLUE, GREEN, ORANGE), strict=True))
+    colours = dict(zip(KINDS, (FAINT, BLUE, GREEN, INK, ORANGE), strict=True))
     for panel, trucks in ((left, TRUCKS), (right, MANY_TRUCKS)):
         some = [row for row in rows if row["trucks"] == trucks]
         names = list(dict.fromkeys(row["pile"] for row in some))
