@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import fnmatch
 import itertools
 import json
 import math
@@ -427,7 +428,12 @@ def main() -> None:
         "--minutes", type=float, default=math.inf, help="begin no run after so long"
     )
     parser.add_argument("--join", action="store_true", help="only join the runs that are there")
-    parser.add_argument("--only", action="append", default=[], help="only runs whose name has this")
+    parser.add_argument(
+        "--only",
+        action="append",
+        metavar="PATTERN",
+        help="only runs whose name matches, as file names do in a shell; more of it: in this order",
+    )
     parser.add_argument("--planner", action="append", default=[], metavar="MODULE:NAME")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -438,10 +444,12 @@ def main() -> None:
         if not options.join:
             until = time.monotonic() + 60.0 * options.minutes
             part, parts = (int(number) for number in options.shard.split("/"))
+            everything = runs(options.preset, chosen)
             todo = [
                 run
-                for run in runs(options.preset, chosen)
-                if all(word in run.name for word in options.only)
+                for pattern in options.only or ["*"]
+                for run in everything
+                if fnmatch.fnmatchcase(run.name, pattern)
             ]
             shown = SMOKE if options.preset == "smoke" else planners
             # All of an instance go to one machine, which then has what they are compared with.

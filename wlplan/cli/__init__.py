@@ -17,8 +17,11 @@ from collections.abc import Sequence
 
 import click
 
-from wlplan.cli import benchmark, gradients, info, learning, maps, planning
+from wlplan.cli import benchmark, gradients, info, kept, learning, maps, planning, programs
 from wlplan.errors import InputError
+
+# Commands in which nothing is compiled.
+_WITHOUT_PROGRAMS = ("info", "cache")
 
 
 class _InOrder(click.Group):
@@ -47,12 +50,14 @@ def wlplan(context: click.Context) -> None:
     """
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
+    elif context.invoked_subcommand not in _WITHOUT_PROGRAMS:
+        context.obj = programs.use_cache()
 
 
 # In the order in which people use them, which is that of the help.
 for _command in (
     *(info.info, planning.plan, planning.simulate, maps.diggability, learning.collect),
-    *(learning.train, learning.evaluate, gradients.gradcheck, benchmark.bench),
+    *(learning.train, learning.evaluate, gradients.gradcheck, benchmark.bench, kept.cache),
 ):
     wlplan.add_command(_command)
 

@@ -96,11 +96,10 @@ def diggability(
     world = world_named(world_name, site, model, pile_state)
     fixed = Action(*action)
     with Progress() as progress, Stopwatch() as mapping:
-        progress("diggability", 0, 1, None)
+        progress.phase("mapping")
         found = ready(
             diggability_map(world, pile, locations=locations, action=fixed, contour=named.contour)
         )
-        progress("diggability", 1, 1, None)
 
     records = {
         name: np.asarray(getattr(part, name), np.float64)

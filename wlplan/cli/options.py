@@ -10,6 +10,7 @@ from typing import Any, cast
 import click
 
 from wlplan.cli.values import LevelOrFile, NameOrReference, Numbers, PlaceOrAuto, WholeNumbers
+from wlplan.cli.verbosity import quiet_or_verbose
 from wlplan.planning import planners
 from wlplan.planning.objectives import OBJECTIVES
 from wlplan.site.machine import MACHINES
@@ -41,6 +42,7 @@ def with_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
     )
 
     def decorate(command: Any) -> Any:
+        command = quiet_or_verbose(command)
         for option in reversed((*options, *common)):
             command = option(command)
         return command

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from wlplan.cli.verbosity import is_asked
 from wlplan.errors import InputError, one_line
 
 
@@ -75,7 +76,8 @@ def json_text(document: Mapping[str, Any]) -> str:
 
 def remark(text: str) -> None:
     """Print on stderr what is worth knowing but no error."""
-    print(f"note: {text}", file=sys.stderr)
+    if not is_asked("quiet"):
+        print(f"note: {text}", file=sys.stderr)
 
 
 def titled_table(title: str) -> Any:

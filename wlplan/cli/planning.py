@@ -38,6 +38,7 @@ from wlplan.cli.options import (
 )
 from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.plan_table import print_plan, remark_on_ledger
+from wlplan.cli.programs import cache_of_command
 from wlplan.cli.progress import Progress, Stopwatch, ready
 from wlplan.constants import QUANTITIES
 from wlplan.planning.objectives import OBJECTIVES
@@ -100,23 +101,28 @@ def plan(
     check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
     folder = None if out is None else checked_folder(out)
+    kept = cache_of_command()
+    kind = f"plan, {world_name}, {planner}{', referee' if referee else ''}"
+    with Progress(kept.seconds(kind)) as progress:
+        progress.phase("starting")
 
-    from wlplan.io.files import atomic_folder
-    from wlplan.planning.objective import objective_of
-    from wlplan.planning.plan import plan_loads, play
-    from wlplan.report.document import plan_document, violations_of, write_plan_folder
+        from wlplan.io.files import atomic_folder
+        from wlplan.planning.objective import objective_of
+        from wlplan.planning.plan import plan_loads, play
+        from wlplan.report.document import plan_document, violations_of, write_plan_folder
 
-    named = pile_named(pile_file, site.machine)
-    pile = named.pile
-    world = world_named(world_name, site, model, pile_state)
-    simulator = world_named("simulator", site)
-    wanted = amount()
-    objective = wanted.objective if objective is None else objective
-    goal = objective_of(objective_named(objective))
-    chosen = planner_named(planner)
-    in_simulator = world_name == "simulator"
-    place = site.with_receiver(named, truck if isinstance(truck, tuple) else None)
-    with Progress() as progress:
+        progress.phase(f"reading {pile_file.name}")
+        named = pile_named(pile_file, site.machine)
+        pile = named.pile
+        world = world_named(world_name, site, model, pile_state)
+        simulator = world_named("simulator", site)
+        wanted = amount()
+        objective = wanted.objective if objective is None else objective
+        goal = objective_of(objective_named(objective))
+        chosen = planner_named(planner)
+        in_simulator = world_name == "simulator"
+        place = site.with_receiver(named, truck if isinstance(truck, tuple) else None)
+        progress.phase("planning")
         with Stopwatch() as planning:
             planned = ready(
                 plan_loads(
@@ -133,51 +139,51 @@ def plan(
                     contour=named.contour,
                 )
             )
+        kept.remember(kind, planning.compiling)
         place = place.replace(receiver=planned.receiver)
+        progress.phase("playing the plan in the simulator")
         with Stopwatch() as playing:
             simulated = planned.refereed or planned
             if planned.refereed is None and not in_simulator:
-                progress("simulator", 0, 1, None)
                 simulated = ready(
                     play(simulator, pile, planned.plan, objective=goal, amount=wanted, site=place)
                 )
-                progress("simulator", 1, 1, None)
-
-    document = plan_document(
-        pile,
-        simulated,
-        site=place,
-        predicted=planned.rollout.performance,
-        predicted_cost=float(planned.cost),
-        stall_probability=planned.stall_probability,
-        amount=wanted,
-        stopped=planned.stopped,
-        seen=getattr(world, "faces_seen", None),
-        pile=named.fields,
-        **site.fields(),
-        world=world_name,
-        planner=planner,
-        objective=objective,
-        referee=referee,
-        seed=seed,
-        **model_fields(model, pile_state),
-    )
-    text = json_text(document)
-    seconds = {"planning": planning.text()}
-    if planned.refereed is None:
-        seconds["simulator"] = playing.text()
-    written = None
-    if folder is not None:
-        with atomic_folder(folder, existing="add") as staging:
-            written = write_plan_folder(
-                staging,
-                document,
-                pile,
-                simulated,
-                site=place,
-                predicted=planned.rollout.performance,
-                settings={f"{name}, wall clock": text for name, text in seconds.items()},
-            )
+        document = plan_document(
+            pile,
+            simulated,
+            site=place,
+            predicted=planned.rollout.performance,
+            predicted_cost=float(planned.cost),
+            stall_probability=planned.stall_probability,
+            amount=wanted,
+            stopped=planned.stopped,
+            seen=getattr(world, "faces_seen", None),
+            pile=named.fields,
+            **site.fields(),
+            world=world_name,
+            planner=planner,
+            objective=objective,
+            referee=referee,
+            seed=seed,
+            **model_fields(model, pile_state),
+        )
+        text = json_text(document)
+        seconds = {"planning": planning.text()}
+        if planned.refereed is None:
+            seconds["simulator"] = playing.text()
+        written = None
+        if folder is not None:
+            progress.phase("drawing")
+            with atomic_folder(folder, existing="add") as staging:
+                written = write_plan_folder(
+                    staging,
+                    document,
+                    pile,
+                    simulated,
+                    site=place,
+                    predicted=planned.rollout.performance,
+                    settings={f"{name}, wall clock": text for name, text in seconds.items()},
+                )
     for note in document["notes"]:
         remark(note)
     remark_on_ledger(document["ledger"])
@@ -273,6 +279,7 @@ def simulate(
     cycles: list[Any] = []
     count = len(given["loads"])
     with Progress() as progress, Stopwatch() as playing:
+        progress.phase("playing")
 
         def keep(number: int, record: Any) -> None:
             cycles.append(record.as_dict())

@@ -1,23 +1,38 @@
-"""How far a long command is, and how long it took."""
+"""What is going on, how far it is, and how long it took."""
 
 from __future__ import annotations
 
 import math
 import sys
+import threading
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+
+from wlplan.cli.verbosity import is_asked
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
 # Seconds between two lines of progress where no bar can be shown.
 _PAUSE = 10.0
+# Programs that are compiled faster than this are not worth a line [s].
+_QUICK = 0.1
 
 
 class Progress:
-    """`progress(stage, done, total, cost)` on stderr: bars on a terminal, now and then a line."""
+    """What is going on, on stderr: `progress(stage, done, total, cost)` and `progress.phase(text)`.
 
-    def __init__(self) -> None:
+    On a terminal a line that moves says it all the time, above bars; elsewhere a line is printed
+    now and then.
+
+    Args:
+        seconds: What compiling took the last time [s]; None if that is not known.
+    """
+
+    def __init__(self, seconds: float | None = None) -> None:
+        self._before = seconds
+        self._live: Any = None
         self._bars: Any = None
         self._tasks: dict[str, TaskID] = {}
         self._told: dict[str, float] = {}
@@ -25,31 +40,62 @@ class Progress:
         # before is compiling, or was there from an earlier run.
         self._begun: dict[str, int] = {}
         self._moving: dict[str, tuple[int, float]] = {}
+        self._phase, self._since = "", 0.0
+        self._quiet = self._verbose = False
+        self._done = threading.Event()
 
     def __enter__(self) -> Progress:
-        if sys.stderr.isatty():
-            from rich import progress
-            from rich.console import Console
+        self._quiet, self._verbose = is_asked("quiet"), is_asked("verbose")
+        self._first = len(_compilations)
+        if self._quiet:
+            return self
+        if not sys.stderr.isatty():
+            threading.Thread(target=self._tell_now_and_then, daemon=True).start()
+            return self
+        from rich import progress
+        from rich.console import Console, Group
+        from rich.live import Live
 
-            self._bars = progress.Progress(
-                progress.TextColumn("{task.description:<12}"),
-                progress.BarColumn(),
-                progress.MofNCompleteColumn(),
-                progress.TimeElapsedColumn(),
-                progress.TextColumn("{task.fields[pace]}"),
-                progress.TextColumn("{task.fields[cost]}"),
-                console=Console(stderr=True),
-                transient=True,
-            )
-            self._bars.start()
+        console = Console(stderr=True)
+        self._bars = progress.Progress(
+            progress.TextColumn("{task.description:<12}"),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TextColumn("{task.fields[pace]}"),
+            progress.TextColumn("{task.fields[cost]}"),
+            console=console,
+        )
+        self._live = Live(
+            Group(_Now(self), self._bars), console=console, transient=True, refresh_per_second=8
+        )
+        self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bars is not None:
-            self._bars.stop()
+        self._done.set()
+        if self._live is not None:
+            self._live.stop()
+
+    def phase(self, text: str) -> None:
+        """Say what begins."""
+        now = time.monotonic()
+        if self._verbose and self._phase:
+            print(f"{self._phase}: {now - self._since:.1f} s", file=sys.stderr, flush=True)
+        self._phase, self._since = text, now
+
+    def now(self) -> str:
+        """What is going on, for how long, and what was compiled for it."""
+        words = [f"{self._phase}, {time.monotonic() - self._since:.0f} s"] if self._phase else []
+        spans = _compilations[self._first :]
+        if seconds := _union(spans, 0.0):
+            before = "" if self._before is None else f" ({self._before:.0f} s the last time)"
+            words.append(f"compiled for {seconds:.0f} s{before}")
+        return "; ".join(words)
 
     def __call__(self, stage: str, done: int, total: int, cost: float | None) -> None:
         """Show how far a stage is, and the cost reached if there is one."""
+        if self._quiet:
+            return
         text = "" if cost is None else f"cost {cost:.3f}"
         now = time.monotonic()
         pace = self._pace(stage, done, total, now)
@@ -65,6 +111,13 @@ class Progress:
         line = ", ".join(filter(None, (f"{stage} {done}/{total}", text, pace)))
         print(line, file=sys.stderr, flush=True)
 
+    def _tell_now_and_then(self) -> None:
+        """A line whenever nothing was told for a while."""
+        while not self._done.wait(_PAUSE):
+            quiet = all(time.monotonic() - told > _PAUSE for told in self._told.values())
+            if quiet and self._phase and not self._done.is_set():
+                print(self.now(), file=sys.stderr, flush=True)
+
     def _pace(self, stage: str, done: int, total: int, now: float) -> str:
         """How many a second, and how long it will still take; nothing while that is not known."""
         if done <= self._begun.setdefault(stage, done):
@@ -78,14 +131,50 @@ class Progress:
         return f"{rate:.3g} a second, {wait} left"
 
 
+class _Now:
+    """A line that says what is going on at the moment it is drawn."""
+
+    def __init__(self, progress: Progress) -> None:
+        from rich.spinner import Spinner
+
+        self._progress, self._spinner = progress, Spinner("dots")
+
+    def __rich__(self) -> Any:
+        self._spinner.update(text=self._progress.now())
+        return self._spinner
+
+
 # Begin and end of everything that JAX has traced and compiled so far [s], of `time.perf_counter`.
 _compilations: list[tuple[float, float]] = []
+_listens: list[bool] = []
+_COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
-def _on_duration(event: str, duration_secs: float, **_: str | int) -> None:
+def _on_duration(event: str, duration_secs: float, **labels: str | int) -> None:
     if event.startswith("/jax/core/compile/"):
         now = time.perf_counter()
         _compilations.append((now - duration_secs, now))
+        if event == _COMPILED and duration_secs > _QUICK and is_asked("verbose"):
+            name = labels.get("fun_name", "a program")
+            print(f"compiled {name}: {duration_secs:.1f} s", file=sys.stderr, flush=True)
+
+
+def listen() -> None:
+    """Has JAX tell of what it compiles, from now on."""
+    import jax
+
+    if not _listens:
+        _listens.append(True)
+        jax.monitoring.register_event_duration_secs_listener(_on_duration)
+
+
+def _union(spans: Sequence[tuple[float, float]], begin: float) -> float:
+    """How long at least one of them lasted, from a moment on: they nest [s]."""
+    seconds, reached = 0.0, begin
+    for first, last in sorted(spans):
+        seconds += max(last - max(first, reached), 0.0)
+        reached = max(reached, last)
+    return seconds
 
 
 class Stopwatch:
@@ -96,24 +185,15 @@ class Stopwatch:
         compiling: Part of it that JAX traced and compiled for [s].
     """
 
-    _listens = False
-
     def __enter__(self) -> Stopwatch:
-        import jax
-
-        if not Stopwatch._listens:
-            jax.monitoring.register_event_duration_secs_listener(_on_duration)
-            Stopwatch._listens = True
+        listen()
         self._first, self._begin = len(_compilations), time.perf_counter()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.seconds = time.perf_counter() - self._begin
-        # Stages nest: one second of compiling inside of tracing counts once.
-        self.compiling, reached = 0.0, self._begin
-        for begin, end in sorted(_compilations[self._first :]):
-            self.compiling += max(end - max(begin, reached), 0.0)
-            reached = max(reached, end)
+        # One second of compiling inside of tracing counts once.
+        self.compiling = _union(_compilations[self._first :], self._begin)
 
     def text(self) -> str:
         """Both times, for people."""
