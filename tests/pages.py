@@ -22,7 +22,7 @@ class Page(HTMLParser):
         """Note the tag and what it refers to."""
         self.tags.append(tag)
         self.links += [value for name, value in attrs if name in ("src", "srcset", "href")]
-        if tag not in ("meta", "img", "br", "link"):
+        if tag not in ("meta", "img", "br", "link", "input"):
             self._open.append(tag)
 
     def handle_endtag(self, tag: str) -> None:
@@ -30,6 +30,6 @@ class Page(HTMLParser):
         assert self._open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        """Collect words; those of the style sheet are none."""
-        if self._open[-1:] != ["style"]:
+        """Collect words; those of the style sheet and of scripts are none."""
+        if self._open[-1:] not in (["style"], ["script"]):
             self.text += data

@@ -10,12 +10,18 @@ from typing import cast
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from wlplan.errors import InputError
 from wlplan.report import figures as plots
-from wlplan.report.figures.digs import _first_crossing, _on_pile, label_places
+from wlplan.report.figures.digs import (
+    MOST_NUMBERED,
+    _first_crossing,
+    _on_pile,
+    label_places,
+)
 from wlplan.report.figures.relief import _relief
 from wlplan.site.receiver import Receiver
 from wlplan.studies.diggability import DiggabilityMap
@@ -71,11 +77,21 @@ def drawn(figure: Figure) -> Figure:
     return figure
 
 
-@pytest.mark.parametrize("loads", [1, 3, 40])
+@pytest.mark.parametrize("loads", [1, 3, MOST_NUMBERED])
 def test_a_plan_is_drawn(pile: Pile, loads: int) -> None:
     figure = drawn(plots.plan_figure(pile, pile, plan_of(pile, loads)))
     texts = [text.get_text() for text in figure.axes[0].texts]
     assert texts == [str(n) for n in range(1, loads + 1)]
+
+
+def test_colours_say_the_order_of_many_digs(pile: Pile) -> None:
+    figure = drawn(plots.plan_figure(pile, pile, plan_of(pile, 80)))
+    assert not figure.axes[0].texts
+    (dots,) = (one for one in figure.axes[0].collections if isinstance(one, PathCollection))
+    brightness = np.asarray(dots.get_facecolor())[:, :3].sum(axis=1)
+    assert len(brightness) == 80
+    assert (np.diff(brightness) <= 0.0).all()
+    assert brightness[0] > brightness[-1] + 1.0
 
 
 def test_a_truck_is_drawn_near_and_pointed_at_far_away(pile: Pile) -> None:

@@ -108,6 +108,7 @@ def plan(
 
         from wlplan.io.files import atomic_folder
         from wlplan.planning.objective import objective_of
+        from wlplan.planning.piles import heights_after
         from wlplan.planning.plan import plan_loads, play
         from wlplan.report.document import plan_document, violations_of, write_plan_folder
 
@@ -154,6 +155,7 @@ def plan(
             site=place,
             predicted=planned.rollout.performance,
             predicted_cost=float(planned.cost),
+            deviation=planned.deviation,
             stall_probability=planned.stall_probability,
             amount=wanted,
             stopped=planned.stopped,
@@ -182,6 +184,7 @@ def plan(
                     simulated,
                     site=place,
                     predicted=planned.rollout.performance,
+                    heights=heights_after(simulator, pile, simulated.plan),
                     settings={f"{name}, wall clock": text for name, text in seconds.items()},
                 )
     for note in document["notes"]:
@@ -242,6 +245,7 @@ def simulate(
     from wlplan.io.files import atomic_folder
     from wlplan.io.files import named as named_file
     from wlplan.planning.amounts import amount_recorded
+    from wlplan.planning.piles import heights_after
     from wlplan.planning.plan import play
     from wlplan.report.document import plan_document, write_plan_folder
     from wlplan.site.frame import frame_recorded
@@ -288,7 +292,7 @@ def simulate(
         progress(engine, 0, count, None)
         played = ready(
             play(
-                world_named(engine, site),
+                simulator := world_named(engine, site),
                 pile,
                 loading_plan,
                 objective=objective,
@@ -330,6 +334,8 @@ def simulate(
                 played,
                 site=place,
                 predicted=predicted,
+                # In discrete elements a load takes minutes, and is not made once more.
+                heights=None if cycles else heights_after(simulator, pile, played.plan),
                 settings={f"{engine}, wall clock": playing.text()},
             )
     for note in document["notes"]:

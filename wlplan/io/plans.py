@@ -31,6 +31,7 @@ def plan_to_dict(
     *,
     predicted: Performance | None = None,
     simulated: Performance | None = None,
+    deviation: Performance | None = None,
     stall_probability: Sequence[float] | None = None,
     transport: Mapping[str, Any] | None = None,
     paths: Sequence[Mapping[str, Any]] | None = None,
@@ -42,6 +43,7 @@ def plan_to_dict(
         plan: The loadings, leaves [N].
         predicted: Performance by the world that planned, leaves [N], tonne, s, kJ.
         simulated: Performance in the simulator, likewise.
+        deviation: Standard deviation of the error of what is predicted, by the same, likewise.
         stall_probability: How likely each load stalls by the world that planned [1].
         transport: Arrays [N] by name, "time" [s] and "work" [kJ], of driving to the truck and back.
         paths: What else is said of each load: its path and its clearance.
@@ -50,6 +52,7 @@ def plan_to_dict(
     pose, action = _columns(plan.pose), _columns(plan.action)
     extra = {
         "predicted": predicted and _columns(predicted),
+        "deviation": deviation and _columns(deviation),
         "transport": transport and {name: np.asarray(v).tolist() for name, v in transport.items()},
         "simulated": simulated and _columns(simulated),
     }

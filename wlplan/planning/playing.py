@@ -67,8 +67,10 @@ class PlanResult(struct.PyTreeNode):
     faces: Characteristics | None = None  # dug, leaves (N,); None: nobody asked for them
     ways: Ways | None = None  # leaves (N, ...); None: nobody asked for them
     solves: SolveReport | None = None  # leaves (N,); None: the world does not say
-    # How likely each load stalls, as foreseen [1]; None: the world does not say.
+    # How likely each load stalls, as foreseen [1], and the standard deviation of the error of its
+    # performance, leaves (N,); None: the world does not say.
     stall_probability: Float[Array, " n"] | None = None
+    deviation: Performance | None = None
     refereed: PlanResult | None = None  # the same plan played by the referee, if there was one
     # Where the loader dumps, leaves (K,) if each truck has its own place; None: as the site has it.
     receiver: Receiver | None = None
@@ -87,6 +89,7 @@ OF_LOADS = (
     "ways",
     "solves",
     "stall_probability",
+    "deviation",
 )
 """Fields of a result, beside plan and performance, whose leaves have an axis of loads."""
 
@@ -137,6 +140,7 @@ def assemble(
     last: Standing,
     solves: SolveReport | None = None,
     stall_probability: Array | None = None,
+    deviation: Performance | None = None,
 ) -> PlanResult:
     """Loadings in order, leaves with leading axis N, and where the last leaves the job."""
     missing = job.amount.missing(last.done)
@@ -153,6 +157,7 @@ def assemble(
         ways=loadings.ways,
         solves=solves,
         stall_probability=stall_probability,
+        deviation=deviation,
     )
 
 
@@ -175,7 +180,11 @@ def play_candidate(
     """
     solve = getattr(job.world, "solve", None) if report else None
     play: Callable[..., Any] = job.world if solve is None else solve
-    foresees: Any = job.world if report and can(job.world, "stall_probability") else None
+    world: Any = job.world
+    foreseen = [
+        getattr(world, name) if report and can(world, name) else None
+        for name in ("stall_probability", "uncertainty")
+    ]
 
     def load(standing: Standing, inputs: Any) -> tuple[Standing, Any]:
         one, leaves, known = inputs
@@ -186,17 +195,15 @@ def play_candidate(
                 height=jnp.where(one.truck >= 0, after.height, standing.pile.height)
             )
         assessed, done = assess(job, standing, one, performance, leaves=leaves, cusps=known)
-        likely = (
-            None
-            if foresees is None
-            else foresees.stall_probability(standing.pile, one.pose, one.action)
-        )
-        return Standing(after, done), (assessed, solved[0] if solved else None, likely)
+        known_before = [
+            None if foresees is None else foresees(standing.pile, one.pose, one.action)
+            for foresees in foreseen
+        ]
+        return Standing(after, done), (assessed, solved[0] if solved else None, *known_before)
 
     leaves = None if candidate.truck is None else leaves_after(candidate.truck)
     last, found = load_by_load(load, beginning(job), (candidate, leaves, cusps))
-    loadings, solves, likely = found
-    return assemble(job, loadings, last, solves, likely)
+    return assemble(job, found[0], last, *found[1:])
 
 
 def leaves_after(truck: Int[Array, " n"]) -> Bool[Array, " n"]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from wlplan.constants import KG_PER_TONNE, QUANTITIES
 from wlplan.io.plans import plan_to_dict
@@ -43,6 +43,7 @@ def plan_document(
     site: Site,
     predicted: Performance | None = None,
     predicted_cost: float | None = None,
+    deviation: Performance | None = None,
     stall_probability: Sequence[float] | Array | None = None,
     amount: Amount | None = None,
     stopped: str = "",
@@ -57,6 +58,7 @@ def plan_document(
         site: Where: its receiver, its frame, and its soil, whose density closes the ledger.
         predicted: What the world that planned foresaw, leaves [N]; None: nothing is known of it.
         predicted_cost: Cost of the plan in that world.
+        deviation: Standard deviation of the error of what it foresaw, leaves [N]; None: not known.
         stall_probability: How likely each load stalls by that world [1]; None: it does not know.
         amount: How much was to be loaded.
         stopped: What ended the search for the plan early, see `PlanResult`.
@@ -75,6 +77,8 @@ def plan_document(
         total["transport"]["wait"] = float(wait.sum())
     if predicted is not None:
         total = {"predicted": totals(predicted, predicted_cost), **total}
+    if deviation is not None:
+        total["deviation"] = {name: _root(getattr(deviation, name)) for name in QUANTITIES}
     ways: dict[str, Any] = (
         {} if simulated.ways is None else {"paths": paths_of(before, simulated, site)}
     )
@@ -87,6 +91,7 @@ def plan_document(
         simulated.plan,
         **ways,
         predicted=predicted,
+        deviation=deviation,
         simulated=simulated.rollout.performance,
         stall_probability=None
         if stall_probability is None
@@ -235,6 +240,7 @@ def write_plan_folder(
     *,
     site: Site,
     predicted: Performance | None = None,
+    heights: Float[np.ndarray, "n nx ny"] | None = None,
     settings: Mapping[str, str] | None = None,
 ) -> list[str]:
     """Writes plan.json, plan.png, totals.png and report.html into a folder.
@@ -246,6 +252,7 @@ def write_plan_folder(
         simulated: The plan as it was played.
         site: With its receiver and its frame.
         predicted: What the world that planned foresaw, leaves [N], if it is known.
+        heights: As each load leaves them [m], for the page; None: it shows pictures alone.
         settings: Further lines for the page's table of settings, by name.
 
     Returns:
@@ -257,6 +264,7 @@ def write_plan_folder(
     from wlplan.io import write_bytes_atomic, write_plan
     from wlplan.report import figures
     from wlplan.report.page import REPORT_NAME, write_report
+    from wlplan.report.scene import scene_of
 
     count = len(document["loads"])
     performance = simulated.rollout.performance
@@ -284,9 +292,15 @@ def write_plan_folder(
             (map_png, "The pile and the digs"),
             (totals_png, "Predicted beside simulated" if predicted is not None else "Simulated"),
         ),
+        scene=None if heights is None else scene_of(pile, heights, document),
         settings=settings,
     )
     return [REPORT_NAME, "plan.json", "plan.png", "totals.png"]
+
+
+def _root(values: Any) -> float:
+    """The deviation of a sum of what errs independently."""
+    return float(np.sqrt(np.square(np.asarray(values, np.float64)).sum()))
 
 
 def _sum(values: Any) -> float:

@@ -15,17 +15,19 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from jinja2 import ChainableUndefined, Environment, Template
+from jinja2 import ChainableUndefined, Environment, PackageLoader, Template
+from markupsafe import Markup
 
-from wlplan.constants import QUANTITIES, Quantity
+from wlplan.constants import QUANTITIES
 from wlplan.io import write_text_atomic
+from wlplan.models.ensemble import PERCENT_90
+from wlplan.report.headline import FUEL_A_MEGAJOULE, headline, trucks_said
 from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error, volume_lost
 from wlplan.report.stands import stands_of
 from wlplan.site.frame import frame_recorded
 
 REPORT_NAME = "report.html"
 
-_CARDS = {**QUANTITIES, "cost": Quantity("cost", "", 2)}
 _DASH, _MINUS, _NO_BREAK = "–", "−", "\u00a0"
 
 
@@ -34,6 +36,7 @@ def write_report(
     document: Mapping[str, Any],
     *,
     figures: Sequence[tuple[bytes, str]] = (),
+    scene: Mapping[str, Any] | None = None,
     settings: Mapping[str, str] | None = None,
 ) -> Path:
     """Write `report.html` into a folder, in one piece or not at all.
@@ -44,6 +47,7 @@ def write_report(
             `transport` of each, `total`, `ledger`, `receiver`, `pile` and the names of what made
             it. What is missing is a dash on the page.
         figures: PNG files as bytes, each with its caption.
+        scene: What is shown in three dimensions, see `wlplan.report.scene`; None: nothing.
         settings: Further lines for the table of settings, by name.
 
     Returns:
@@ -53,7 +57,9 @@ def write_report(
         InputError: If it cannot be written.
     """
     path = Path(folder) / REPORT_NAME
-    write_text_atomic(path, render_report(document, figures=figures, settings=settings))
+    write_text_atomic(
+        path, render_report(document, figures=figures, scene=scene, settings=settings)
+    )
     return path
 
 
@@ -61,6 +67,7 @@ def render_report(
     document: Mapping[str, Any],
     *,
     figures: Sequence[tuple[bytes, str]] = (),
+    scene: Mapping[str, Any] | None = None,
     settings: Mapping[str, str] | None = None,
 ) -> str:
     """The report as HTML; arguments as for `write_report`. Every text is escaped."""
@@ -71,7 +78,11 @@ def render_report(
         offset=frame_recorded(document).offset,
         quantities=QUANTITIES,
         stands=stands_of(document),
-        cards=_CARDS,
+        job=headline(document),
+        trucks=trucks_said(document),
+        fuel=FUEL_A_MEGAJOULE,
+        scene=scene,
+        plotly=None if scene is None else _plotly(),
         ledger={
             "lost": volume_lost(ledger),
             "error": error,
@@ -86,9 +97,17 @@ def render_report(
 
 
 @functools.cache
+def _plotly() -> Markup:
+    """The library that draws in three dimensions, as it is in its package: part of the page."""
+    source = resources.files("plotly").joinpath("package_data", "plotly.min.js")
+    return Markup(source.read_text(encoding="utf-8"))
+
+
+@functools.cache
 def _template() -> Template:
     environment = Environment(
         autoescape=True,
+        loader=PackageLoader("wlplan", "report"),
         undefined=ChainableUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -99,13 +118,14 @@ def _template() -> Template:
         "coordinate": _coordinate,
         "degrees": _degrees,
         "difference": _difference,
+        "minutes": _minutes,
+        "nine_in_ten": _nine_in_ten,
         "number": _number,
         "percent": _percent,
         "plain": _plain,
         "share": _share,
     }
-    source = resources.files("wlplan.report").joinpath("page.html.j2")
-    return environment.from_string(source.read_text(encoding="utf-8"))
+    return environment.get_template("page.html.j2")
 
 
 def _finite(value: object) -> float | None:
@@ -129,6 +149,21 @@ def _degrees(angle: object) -> int | None:
     """Whole degrees of an angle [rad]."""
     number = _finite(angle)
     return None if number is None else round(math.degrees(number))
+
+
+def _nine_in_ten(deviation: object) -> str:
+    """Half of the interval that holds nine in ten, of a standard deviation."""
+    number = _finite(deviation)
+    return _DASH if number is None else f"{PERCENT_90 * number:.1g}"
+
+
+def _minutes(seconds: object) -> str:
+    """A time for people; a dash where there is none."""
+    number = _finite(seconds)
+    if number is None:
+        return _DASH
+    minutes, rest = divmod(round(number), 60)
+    return f"{minutes}{_NO_BREAK}min {rest:02d}{_NO_BREAK}s" if minutes else f"{rest}{_NO_BREAK}s"
 
 
 def _difference(predicted: object, simulated: object) -> str:

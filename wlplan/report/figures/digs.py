@@ -7,7 +7,10 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from wlplan.report.figures.relief import RISE, height_above_ground
@@ -16,6 +19,10 @@ from wlplan.types import Pile
 
 # Radius of the numbers of the digs, as a part of the longer side of the view.
 LABEL_PART = 0.02
+# More digs than this have colours instead of numbers.
+MOST_NUMBERED = 20
+# Light to dark, told apart by everybody, and none of them the colour of soil.
+ORDER = LinearSegmentedColormap.from_list("order", ("#8fd3ff", "#1f5fa8", "#0b1f3a"))
 
 
 def label_places(
@@ -133,3 +140,32 @@ def draw_digs(
             zorder=9,
         )
     panel.plot(*digs.T, "o", color=BLUE, markersize=4.0, markeredgecolor="white", mew=0.6, zorder=7)
+
+
+def draw_many_digs(
+    figure: Figure,
+    panel: Axes,
+    digs: Float[np.ndarray, "n 2"],
+    heading: Float[np.ndarray, " n"],
+    radius: float,
+) -> None:
+    """Dig locations and headings, whose colours say the order, with a bar of the colours."""
+    norm = Normalize(1, len(digs))
+    back = digs - 2.2 * radius * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    colours = ORDER(norm(np.arange(1, len(digs) + 1)))
+    panel.add_collection(
+        LineCollection(
+            list(np.stack([back, digs], axis=1)), colors=colours, linewidths=1.4, zorder=6
+        )
+    )
+    panel.scatter(
+        digs[:, 0], digs[:, 1], c=colours, s=20.0, edgecolors="white", linewidths=0.6, zorder=7
+    )
+    bar = figure.colorbar(
+        ScalarMappable(norm, ORDER),
+        cax=panel.inset_axes((0.58, 0.055, 0.38, 0.022)),
+        orientation="horizontal",
+    )
+    bar.set_ticks([1, len(digs)], labels=["load 1", str(len(digs))])
+    bar.ax.tick_params(labelsize=8, length=2)
+    bar.outline.set_visible(False)

@@ -10,7 +10,13 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from wlplan.report.figures.digs import LABEL_PART, draw_digs, label_places
+from wlplan.report.figures.digs import (
+    LABEL_PART,
+    MOST_NUMBERED,
+    draw_digs,
+    draw_many_digs,
+    label_places,
+)
 from wlplan.report.figures.relief import (
     PILE,
     add_legend,
@@ -42,7 +48,8 @@ def plan_figure(
 ) -> Figure:
     """The pile with its numbered digs, and the pile that is left, side by side.
 
-    A dot marks the dig location, an arrow the heading, and the number on the outside the order.
+    A dot marks the dig location, an arrow the heading, and the number on the outside the order; of
+    more than twenty digs their colour.
 
     Args:
         before: Pile before the first loading.
@@ -65,7 +72,8 @@ def plan_figure(
         seen = np.concatenate([digs, *near, *(way[:, :2] for way in ways)])
     # Labels are as large as the map allows, and the map widens to hold them.
     radius = LABEL_PART * float(np.ptp(view_of(before, seen), axis=0).max())
-    labels = label_places(digs, heading, radius, before)
+    many = len(digs) > MOST_NUMBERED
+    labels = digs if many else label_places(digs, heading, radius, before)
     view = grow_to_ratio(view_of(before, np.concatenate([seen, labels])))
 
     figure, panels = map_panels(view, 2)
@@ -81,7 +89,10 @@ def plan_figure(
         for truck in trucks:
             draw_truck(panel, truck, view)
     draw_ways(panels[0], ways)
-    draw_digs(panels[0], digs, heading, labels, radius)
+    if many:
+        draw_many_digs(figure, panels[0], digs, heading, radius)
+    else:
+        draw_digs(panels[0], digs, heading, labels, radius)
     for panel, line in zip(panels, ("solid", "dashed"), strict=True):
         draw_toe(panel, before, line)
     panels[1].plot(*digs.T, "o", color=BLUE, markersize=2.5, zorder=5)
@@ -92,5 +103,8 @@ def plan_figure(
     )
     bar.set_label("height above the ground [m]")
     bar.outline.set_visible(False)
-    add_legend(figure, before, ways=bool(ways), area=area is not None)
+    drawn = "line: heading, colour: order" if many else "arrow: heading, number: order"
+    add_legend(
+        figure, before, f"dot: dig location, {drawn}", ways=bool(ways), area=area is not None
+    )
     return figure

@@ -139,11 +139,13 @@ def _contour_step(highest: float) -> float:
     return next((s for s in _CONTOUR_STEPS if highest / s >= _LEAST_CONTOURS), _CONTOUR_STEPS[-1])
 
 
-def add_legend(figure: Figure, pile: Pile, *, ways: bool = False, area: bool = False) -> None:
-    """One line under the maps that says what their lines mean."""
+def add_legend(
+    figure: Figure, pile: Pile, digs: str, *, ways: bool = False, area: bool = False
+) -> None:
+    """One line under the maps that says what their lines mean, and how digs are drawn."""
     parts = [
         f"contour lines every {_contour_step(float(height_above_ground(pile).max())):g} m",
-        "dot: dig location, arrow: heading, number: order",
+        digs,
         "blue outline: toe before",
     ]
     if ways:
