@@ -22,6 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 import wlplan
 from experiments._common.budgets import OverBudget, Within
@@ -35,6 +36,7 @@ from experiments._common.comparison import (
 )
 from experiments._common.instances import EACH, JOBS, PILES, SITES, SMOKE_JOB, Instance
 from experiments._common.results import PRESETS, RESULTS, write_result
+from wlplan.cli.progress import Stopwatch
 from wlplan.io import write_bytes_atomic, write_text_atomic
 from wlplan.planning.amounts import Made, typical_load
 from wlplan.planning.job import make_job, with_toe
@@ -54,7 +56,7 @@ from wlplan.planning.truck_search import best_place
 from wlplan.planning.watch import EFFORTS, Watch
 from wlplan.plugins import load_object
 from wlplan.report.figures import png_bytes
-from wlplan.report.figures.style import BLUE, FAINT, ORANGE, new_figure, tidy
+from wlplan.report.figures.style import BLUE, FAINT, GREEN, ORANGE, new_figure, tidy
 from wlplan.site.receiver import Receiver
 
 ROWS = Path("out") / "planner_benchmark"
@@ -89,8 +91,6 @@ STEPS = (
 """What a user may add to greedy with a fixed truck, one after another."""
 # A cycle of filling that takes longer than this has stalled [s].
 _STALL = 18.0
-# So little compiling does not show in the time of a run [s].
-_WARM = 0.5
 
 
 def _always(planner: Callable[[], Planner]) -> Callable[[int], Planner]:
@@ -227,8 +227,6 @@ def play_run(
     site = run.instance.site_of(pile)
     if receiver is not None:
         site = site.replace(receiver=receiver)
-    clock, processor = time.perf_counter(), time.process_time()
-    _compiled.seconds = 0.0
     row: dict[str, Any] = {**dataclasses.asdict(run.instance), "planner": run.planner}
     row |= {"budget": run.budget, "seed": run.seed, "made_with": made_with(run, planner)}
     hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
@@ -236,25 +234,25 @@ def play_run(
     in_referee = run.planner.endswith(IN_REFEREE)
     within = Within(planner, ratio, of_greedy, referee=simulator, in_referee=in_referee)
     try:
-        result = wlplan.plan_loads(
-            hybrid,
-            pile,
-            amount=run.instance.amount,
-            site=site,
-            planner=within,
-            truck="each" if run.instance.site == EACH else None,
-            seed=run.seed,
-            referee=simulator,
-            mend=False,
-        )
+        with Stopwatch() as planning:
+            result = wlplan.plan_loads(
+                hybrid,
+                pile,
+                amount=run.instance.amount,
+                site=site,
+                planner=within,
+                truck="each" if run.instance.site == EACH else None,
+                seed=run.seed,
+                referee=simulator,
+                mend=False,
+            )
+            jax.block_until_ready(result.cost)
     except OverBudget:
         return {**row, "plan": None}
-    jax.block_until_ready(result.cost)
     assert result.refereed is not None
     assert result.receiver is not None
     row |= {"spent": within.spent, "searches": within.searches, "rows": within.rows}
-    row |= {"seconds": time.perf_counter() - clock, "processor": time.process_time() - processor}
-    row["compiled"] = _compiled.seconds > _WARM
+    row["seconds"] = planning.seconds - planning.compiling
     # What was planned in the referee is foreseen by the world that planned it only afterwards.
     row["predicted"] = float(result.cost) if in_referee else within.predicted
     row["simulator"] = _summary(result.refereed)
@@ -267,21 +265,6 @@ def play_run(
         "receiver": [np.round(v, 4).tolist() for v in jax.tree.leaves(result.receiver)],
     }
     return row
-
-
-class _Compiled:
-    """How long XLA compiled [s]."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-        jax.monitoring.register_event_duration_secs_listener(self._add)
-
-    def _add(self, event: str, duration_secs: float, **_: Any) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            self.seconds += duration_secs
-
-
-_compiled = _Compiled()
 
 
 def _summary(played: wlplan.PlanResult) -> dict[str, float]:
@@ -374,42 +357,47 @@ def run(preset: str, rows: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
 def draw(folder: Path) -> None:
     """Gain of each planner against what it evaluates and against the time that takes."""
     table = json.loads((folder / "planner_benchmark.json").read_text())["planners"]
-    jobs = list(dict.fromkeys(row["job"] for row in table))
-    figure = new_figure(2.4 * len(jobs) + 1.6, 4.8)
+    jobs = [job for job in JOBS if any(row["job"] == job for row in table)] or [SMOKE_JOB]
+    figure = new_figure(2.6 * len(jobs) + 1.2, 5.4)
     panels = figure.subplots(2, len(jobs), sharey="col", squeeze=False)
-    names = [name for name in dict.fromkeys(row["planner"] for row in table) if name != "greedy"]
-    styles = {
-        name: (BLUE if "tree" in name else ORANGE, "osD^vP*Xdp"[k % 10])
-        for k, name in enumerate(names)
+    names = list(dict.fromkeys(row["planner"] for row in table if row["planner"] != "greedy"))
+    colours = {
+        name: ORANGE if name.endswith(IN_REFEREE) else GREEN if "tree" in name else BLUE
+        for name in names
     }
+    marks = {name: "osD^vP*Xdph<>8"[k % 14] for k, name in enumerate(names)}
     for column, job in zip(panels.T, jobs, strict=True):
-        for panel, measure in zip(column, ("spent", "search_processor"), strict=True):
-            for name in names:
-                of = [row for row in table if (row["job"], row["planner"]) == (job, name)]
-                of = sorted(of, key=lambda row: (row["site"], row["budget"]))
-                colour, mark = styles[name]
-                for _, group in itertools.groupby(of, key=lambda row: row["site"]):
-                    points = [row for row in group if row[measure] is not None]
+        # Of trucks and tonnes a cost is mostly what is missing: time says more.
+        what = "cost" if "loads" in job else "seconds_a_tonne"
+        of_job = [row for row in table if row["job"] == job and row["planner"] != "greedy"]
+        for panel, measure in zip(column, ("spent", "search"), strict=True):
+            for row in of_job:
+                if row[measure] is not None:
                     panel.plot(
-                        [row[measure] for row in points],
-                        [row["cost"]["mean"] for row in points],
-                        marker=mark,
-                        ms=4,
-                        lw=0.8,
-                        color=colour,
+                        row[measure],
+                        row[what]["mean"],
+                        marker=marks[row["planner"]],
+                        ms=5,
+                        color=colours[row["planner"]],
+                        # Empty where the truck stands where the planner wants it.
+                        fillstyle="full" if row["site"] in ("fixed truck", "walls") else "none",
                     )
             panel.axhline(0.0, color=FAINT, lw=0.8)
-            # Times are known of runs only in which nothing was compiled.
-            if any(row[measure] is not None for row in table if row["job"] == job):
-                panel.set_xscale("log")
-            panel.set_yscale("symlog", linthresh=5.0)
+            panel.set_xscale("log")
+            panel.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
+            panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+            panel.xaxis.set_minor_formatter(NullFormatter())
+            low, high = panel.get_ylim()
+            panel.set_ylim(max(low, -12.0), min(high, 30.0))
             tidy(panel)
+            panel.tick_params(labelsize=7)
         column[0].set_title(job, fontsize=9)
+        less = "cost" if what == "cost" else "time a tonne"
+        column[0].set_ylabel(f"{less}, less than greedy's [%]", fontsize=8)
+        column[1].set_ylabel(f"{less}, less than greedy's [%]", fontsize=8)
         column[0].set_xlabel("evaluations, in loadings", fontsize=8)
-        column[1].set_xlabel("processor time [s]", fontsize=8)
-    for row in panels:
-        row[0].set_ylabel("cost less than greedy's [%]", fontsize=8)
-    handles = [panels[0, 0].plot([], [], styles[n][1], color=styles[n][0], ms=4)[0] for n in names]
+        column[1].set_xlabel("search, without compiling [s]", fontsize=8)
+    handles = [panels[0, 0].plot([], [], marks[n], color=colours[n], ms=5)[0] for n in names]
     figure.legend(handles, names, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     write_bytes_atomic(folder / "planner_benchmark.png", png_bytes(figure))
 

@@ -113,13 +113,12 @@ def by_planner(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         if not found:
             continue
         own = [row for row in here if _case(row) == case]
-        of: dict[str, float | None] = {
-            "spent": statistics.median(float(row["spent"]) for row in own)
+        # Compiling not counted; not known of rows that were made before the two were told apart.
+        known = [float(row["seconds"]) for row in own if "seconds" in row]
+        of = {
+            "spent": statistics.median(float(row["spent"]) for row in own),
+            "search": statistics.median(known) if known else None,
         }
-        # Times tell something where nothing was compiled.
-        warm = [row for row in own if not row["compiled"]]
-        for name in ("seconds", "processor"):
-            of[f"search_{name}"] = statistics.median(float(r[name]) for r in warm) if warm else None
         table.append({"job": job, **case._asdict(), **of, **_intervals(found)})
     return table
 
