@@ -942,11 +942,18 @@ def test_the_names_offered_are_those_that_exist() -> None:
     assert set(cli.options.UPS) == set(TURNS)
 
 
+def test_what_is_exported_needs_a_folder(run: Run) -> None:
+    code, _, err = run("plan", "--also", "dxf")
+    assert code == 2
+    assert "--out DIR" in err
+
+
 def test_the_report_stands_alone_and_escapes_names(run: Run, tmp_path: Path) -> None:
     name = "<b>&'x\".npz"
     path = tmp_path / name
     io.write_pile(path, seed_pile("conical", slope=math.radians(30.0), height=2.0, seed=1))
-    run("plan", path, "--loads", 1, "--out", tmp_path / "out")
+    run("plan", path, "--loads", 1, "--out", tmp_path / "out", "--also", "geojson")
+    assert (tmp_path / "out" / "plan.geojson").exists()
     source = (tmp_path / "out" / "report.html").read_text()
     assert "<b>&'x" not in source
     page = Page(source)

@@ -13,6 +13,7 @@ from wlplan.cli.values import LevelOrFile, NameOrReference, Numbers, PlaceOrAuto
 from wlplan.cli.verbosity import quiet_or_verbose
 from wlplan.planning import planners
 from wlplan.planning.objectives import OBJECTIVES
+from wlplan.report.exports import KINDS as EXPORTS
 from wlplan.site.machine import MACHINES
 from wlplan.site.soil import SOILS
 from wlplan.training.settings import KINDS, Setting, setting_of
@@ -325,6 +326,13 @@ placed_truck_option = click.option(
     default=None,
     help=f"{_TRUCK_HELP}; auto: where the planner finds loads cheapest; each: likewise for each "
     f"of --trucks anew.",
+)
+also_option = click.option(
+    "--also",
+    multiple=True,
+    type=click.Choice(EXPORTS),
+    help="Write the plan as GeoJSON or DXF, or the pile after it as GeoTIFF, into the folder too; "
+    "may be given again.",
 )
 out_option = click.option(
     "--out", metavar="DIR", default=None, help="Folder to write to. It is made if it is missing."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from wlplan.cli.inputs import (
 )
 from wlplan.cli.options import (
     PileFile,
+    also_option,
     engine_option,
     model_options,
     objective_option,
@@ -41,7 +42,9 @@ from wlplan.cli.plan_table import print_plan, remark_on_ledger
 from wlplan.cli.programs import cache_of_command
 from wlplan.cli.progress import Progress, Stopwatch, ready
 from wlplan.constants import QUANTITIES
+from wlplan.errors import InputError
 from wlplan.planning.objectives import OBJECTIVES
+from wlplan.report.exports import check as check_exports
 
 if TYPE_CHECKING:
     from wlplan.planning.amounts import Amount
@@ -74,6 +77,7 @@ _ORIGIN_FIELDS = ("world", "model", "pile_state", "planner", "seed")
     *site_options(),
     *model_options,
     out_option,
+    also_option,
 )
 def plan(
     pile_file: PileFile,
@@ -88,6 +92,7 @@ def plan(
     model: str | None,
     pile_state: str | None,
     out: str | None,
+    also: tuple[str, ...],
     seed: int,
     as_json: bool,
 ) -> None:
@@ -100,7 +105,7 @@ def plan(
     check_pile_name(pile_file.name)
     check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
-    folder = None if out is None else checked_folder(out)
+    folder = _folder_of(out, also)
     kept = cache_of_command()
     kind = f"plan, {world_name}, {planner}{', referee' if referee else ''}"
     with Progress(kept.seconds(kind)) as progress:
@@ -186,6 +191,7 @@ def plan(
                     predicted=planned.rollout.performance,
                     heights=heights_after(simulator, pile, simulated.plan),
                     settings={f"{name}, wall clock": text for name, text in seconds.items()},
+                    also=also,
                 )
     for note in document["notes"]:
         remark(note)
@@ -202,6 +208,18 @@ def plan(
         raise click.exceptions.Exit(_INTERRUPTED)
 
 
+def _folder_of(out: str | None, also: Sequence[str]) -> Path | None:
+    """The folder to write to, and a check that all can be written there.
+
+    Raises:
+        InputError: If not, or if there is no folder for what is exported.
+    """
+    if also and out is None:
+        raise InputError("--also needs a folder to write to: give --out DIR.")
+    check_exports(also)
+    return None if out is None else checked_folder(out)
+
+
 def _print_written(folder: Path | None, written: list[str] | None) -> None:
     if folder is None or written is None:
         print("nothing written: --out DIR writes the plan, the figures and a report")
@@ -216,7 +234,9 @@ def _print_written(folder: Path | None, written: list[str] | None) -> None:
 )
 @pile_argument(required=True)
 @click.argument("plan_file", metavar="PLAN.json")
-@with_options(engine_option, truck_option, *site_options("that of the plan"), out_option)
+@with_options(
+    engine_option, truck_option, *site_options("that of the plan"), out_option, also_option
+)
 def simulate(
     pile_file: PileFile,
     plan_file: str,
@@ -225,6 +245,7 @@ def simulate(
     soil: str | None,
     machine: str | None,
     out: str | None,
+    also: tuple[str, ...],
     seed: int,
     as_json: bool,
 ) -> None:
@@ -239,7 +260,7 @@ def simulate(
     check_pile_name(pile_file.name)
     site_named(soil, machine)  # wrong options are refused before anything heavy is imported
 
-    folder = None if out is None else checked_folder(out)
+    folder = _folder_of(out, also)
 
     from wlplan.io import read_plan
     from wlplan.io.files import atomic_folder
@@ -337,6 +358,7 @@ def simulate(
                 # In discrete elements a load takes minutes, and is not made once more.
                 heights=None if cycles else heights_after(simulator, pile, played.plan),
                 settings={f"{engine}, wall clock": playing.text()},
+                also=also,
             )
     for note in document["notes"]:
         remark(note)

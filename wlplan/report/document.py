@@ -242,8 +242,9 @@ def write_plan_folder(
     predicted: Performance | None = None,
     heights: Float[np.ndarray, "n nx ny"] | None = None,
     settings: Mapping[str, str] | None = None,
+    also: Sequence[str] = (),
 ) -> list[str]:
-    """Writes plan.json, plan.png, totals.png and report.html into a folder.
+    """Writes plan.json, plan.png, totals.png, report.html and what is exported into a folder.
 
     Args:
         folder: Existing folder.
@@ -254,6 +255,7 @@ def write_plan_folder(
         predicted: What the world that planned foresaw, leaves [N], if it is known.
         heights: As each load leaves them [m], for the page; None: it shows pictures alone.
         settings: Further lines for the page's table of settings, by name.
+        also: What is exported, see `wlplan.report.exports`.
 
     Returns:
         Names of the files, the page first.
@@ -263,6 +265,7 @@ def write_plan_folder(
     """
     from wlplan.io import write_bytes_atomic, write_plan
     from wlplan.report import figures
+    from wlplan.report.exports import exported
     from wlplan.report.page import REPORT_NAME, write_report
     from wlplan.report.scene import scene_of
 
@@ -295,7 +298,10 @@ def write_plan_folder(
         scene=None if heights is None else scene_of(pile, heights, document),
         settings=settings,
     )
-    return [REPORT_NAME, "plan.json", "plan.png", "totals.png"]
+    more = exported(also, document, simulated.rollout.pile)
+    for name, content in more.items():
+        write_bytes_atomic(folder / name, content)
+    return [REPORT_NAME, "plan.json", "plan.png", "totals.png", *more]
 
 
 def _root(values: Any) -> float:

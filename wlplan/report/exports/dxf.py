@@ -1,0 +1,44 @@
+"""A plan as DXF, in metres: a layer each for digs, approaches, ways in either gear, trucks."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+from wlplan.report.exports import parts
+from wlplan.types import Pile
+
+LIBRARY = "ezdxf"
+NAME = "plan.dxf"
+# Layers and their colours, by the numbers that AutoCAD has for them.
+LAYERS = {"DIGS": 5, "APPROACH": 5, "WAY_REVERSE": 8, "WAY_FORWARD": 7, "TRUCKS": 3}
+_METRES = 6
+# Height of the numbers [m].
+_TEXT = 0.4
+
+
+def content(document: Mapping[str, Any], after: Pile) -> bytes:
+    """The file; arguments as of `wlplan.report.exports.exported`."""
+    from ezdxf import filemanagement
+
+    del after
+    drawing = filemanagement.new("R2010", units=_METRES)
+    for name, colour in LAYERS.items():
+        drawing.layers.add(name, color=colour)
+    space = drawing.modelspace()
+    for number, _, line in parts.digs(document):
+        start, tip = (tuple(map(float, point)) for point in line)
+        space.add_point(tip, dxfattribs={"layer": "DIGS"})
+        text = {"layer": "DIGS", "height": _TEXT}
+        space.add_text(str(number), dxfattribs=text).set_placement(tip)
+        space.add_line(start, tip, dxfattribs={"layer": "APPROACH"})
+    for _, name, points in parts.legs(document):
+        layer = {"layer": f"WAY_{name.upper()}"}
+        space.add_lwpolyline([tuple(map(float, point)) for point in points], dxfattribs=layer)
+    for _, corners in parts.trucks(document):
+        ring = [tuple(map(float, corner)) for corner in corners]
+        space.add_lwpolyline(ring, close=True, dxfattribs={"layer": "TRUCKS"})
+    buffer = io.StringIO()
+    drawing.write(buffer)
+    return buffer.getvalue().encode(drawing.output_encoding)

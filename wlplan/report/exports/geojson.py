@@ -1,0 +1,49 @@
+"""A plan as GeoJSON: digs, approaches, ways and trucks as features.
+
+The coordinates are those of the scan, and the member `crs` names their reference system as GDAL and
+QGIS read it, though RFC 7946 knows longitude and latitude alone: a site is staked out in metres.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from wlplan.report.exports import parts
+from wlplan.site.frame import frame_recorded
+from wlplan.types import Pile
+
+LIBRARY: str | None = None
+NAME = "plan.geojson"
+# Millimetres are more than anybody stakes out.
+_DIGITS = 3
+
+
+def content(document: Mapping[str, Any], after: Pile) -> bytes:
+    """The file; arguments as of `wlplan.report.exports.exported`."""
+    del after
+    features = []
+    for number, load, line in parts.digs(document):
+        facts = {"load": number, "heading_deg": round(float(np.degrees(load["heading"])), 1)}
+        for name, value in (load.get("simulated") or {}).items():
+            facts[name] = round(value, _DIGITS)
+        features.append(_feature("Point", line[1], kind="dig", **facts))
+        features.append(_feature("LineString", line, kind="approach", load=number))
+    for number, name, points in parts.legs(document):
+        features.append(_feature("LineString", points, kind=f"way, {name}", load=number))
+    for name, corners in parts.trucks(document):
+        ring = np.concatenate([corners, corners[:1]])
+        features.append(_feature("Polygon", ring[None], kind="truck", name=name))
+    crs = frame_recorded(document).crs
+    named = {"crs": {"type": "name", "properties": {"name": crs}}} if crs else {}
+    return json.dumps(
+        {"type": "FeatureCollection", **named, "features": features}, allow_nan=False
+    ).encode()
+
+
+def _feature(shape: str, points: np.ndarray, **properties: Any) -> dict[str, Any]:
+    geometry = {"type": shape, "coordinates": np.round(points, _DIGITS).tolist()}
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
