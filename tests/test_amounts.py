@@ -183,6 +183,25 @@ def test_tonnes_end_with_the_bucket_that_reaches_them() -> None:
     assert result.plan.truck is None
 
 
+def test_the_referee_counts_what_is_done() -> None:
+    """Its buckets hold a quarter more, so it takes fewer of them."""
+
+    def fuller(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+        after, performance = bowl_world(pile, pose, action)
+        return after, performance.replace(mass=1.25 * performance.mass)
+
+    few = Greedy(actions=6, refine_steps=4, refined=2, poses_per_metre=0.4)
+    # Two parts.
+    amount = Tonnes(70.0)
+    plan = plan_loads(
+        bowl_world, cone(), amount=amount, planner=few, site=SITE, referee=fuller, mend=False
+    )
+    assert plan.refereed is not None
+    mass = np.asarray(plan.refereed.rollout.performance.mass)
+    assert 70.0 <= mass.sum() < 70.0 + mass.max()
+    assert float(plan.refereed.missing) == 0.0
+
+
 @pytest.mark.slow
 def test_a_pile_is_emptied_of_all_that_is_worth_a_load() -> None:
     pile = cone(radius=4.0)

@@ -165,9 +165,11 @@ def plan_loads(
             break
         parts.append(result)
         receivers.append(of_part.site.placed_receiver)
-        made = _made_with(made, result)
-        # What is planned next is planned on the pile as the referee has it by then.
-        job = job.replace(pile=(result.refereed or result).rollout.pile)
+        # What is planned next is planned on the pile as the referee has it by then, and for what is
+        # left to do there.
+        played = result.refereed or result
+        made = _made_with(made, played)
+        job = job.replace(pile=played.rollout.pile)
     if not parts and watch.stopped == "interrupted":
         raise KeyboardInterrupt
     if not parts:
