@@ -10,6 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import click
+
 from wlplan.cli.verbosity import is_asked
 from wlplan.errors import InputError, one_line
 
@@ -103,3 +105,8 @@ def print_table(table: Any) -> None:
     width = None if sys.stdout.isatty() else 140
     # Units stand in square brackets, which would count as markup.
     Console(width=width, highlight=False, markup=False).print(table)
+
+
+def print_bold(text: str) -> None:
+    """Print on stdout what is to be seen first, bold where there is a terminal."""
+    print(click.style(text, bold=True) if sys.stdout.isatty() else text)

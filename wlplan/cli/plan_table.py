@@ -6,8 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from wlplan.cli.outputs import print_table, remark, titled_table
+from wlplan.cli.outputs import print_bold, print_table, remark, titled_table
 from wlplan.constants import QUANTITIES
+from wlplan.report.headline import headline, trucks_said
 from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error
 from wlplan.report.stands import stands_of
 from wlplan.site.frame import frame_recorded
@@ -66,6 +67,9 @@ def print_plan(document: Mapping[str, Any]) -> None:
     table.add_row("sum", "", "", "", *cells(total, total["transport"]), style="bold")
     print_table(table)
 
+    print_bold(_job(headline(document)))
+    for line in trucks_said(document):
+        print(line)
     for q, (title, unit, _) in QUANTITIES.items():
         simulated = total["simulated"][q]
         if predicted and simulated:
@@ -74,14 +78,9 @@ def print_plan(document: Mapping[str, Any]) -> None:
                 f"{title}: predicted {predicted[q]:.1f} {unit}, simulated {simulated:.1f} {unit}, "
                 f"difference {off:+.1f} %"
             )
-    for number, truck in enumerate(document.get("trucks", []), start=1):
-        passes = len(truck["loads"])
-        of = f" of {truck['payload']:g} t" if "payload" in truck else ""
-        print(f"truck {number}: {truck['mass']:.1f} t{of} in {passes} load{'s'[: passes > 1]}")
     for who, stand in stands_of(document):
         where, into = frame.place(stand["x"], stand["y"]), math.degrees(stand["heading"])
         print(f"{who}: the loader dumps at {where}, heading {into:.0f}°")
-    print(_times(total))
     costs = [f"{part} {total[part]['cost']:.3f}" for part in total if "cost" in total[part]]
     print(f"cost for {document['objective']}: {', '.join(costs)}")
     lost = ledger["volume_before"] - ledger["volume_after"]
@@ -97,14 +96,12 @@ def print_plan(document: Mapping[str, Any]) -> None:
         )
 
 
-def _times(total: Mapping[str, Any]) -> str:
-    """How long the job takes, and what it moves an hour."""
-    digging, transport = total["simulated"]["time"], total["transport"]
-    wait = transport.get("wait", 0.0)
-    whole = digging + transport["time"] + wait
-    waiting = f", {wait:.0f} s of waiting for trucks" if wait else ""
-    rate = 3600.0 * total["simulated"]["mass"] / whole if whole else 0.0
+def _job(job: Mapping[str, float]) -> str:
+    """All that is loaded, how long that takes, and what of that is what."""
+    minutes, seconds = divmod(round(job["time"]), 60)
+    waiting = f", waiting {job['waiting']:.0f} s" if job["waiting"] else ""
     return (
-        f"whole job: {whole / 60.0:.1f} min, {digging:.0f} s of digging, {transport['time']:.0f} s "
-        f"of transport{waiting}; {rate:.0f} t/h"
+        f"{job['mass']:.1f} t in {minutes} min {seconds:02d} s, {job['rate']:.0f} t/h: digging "
+        f"{job['digging']:.0f} s, driving {job['driving']:.0f} s, dumping {job['dumping']:.0f} s"
+        f"{waiting}; {job['energy']:.1f} MJ, about {job['fuel']:.1f} l of diesel"
     )
