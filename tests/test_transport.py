@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan.constants import GRAVITY
+from wlplan.constants import DUMP_TIME, GRAVITY
 from wlplan.planning.driving import Way, room_of
 from wlplan.planning.loading import Transport
-from wlplan.planning.transport import DUMP_TIME, SHIFT_TIME, transport
+from wlplan.planning.transport import SHIFT_TIME, transport
 from wlplan.planning.yard import yard_of
 from wlplan.site.machine import WA320
 from wlplan.site.receiver import Receiver

@@ -14,6 +14,9 @@ J_PER_KJ = 1000.0
 # Grid spacing of the models and of the paper's terrain [m]. Paper, section 5.1.
 CELL_SIZE = 0.1
 
+# Dumping [s]. Follow-up: 5 s, without work.
+DUMP_TIME = 5.0
+
 # Box of the action parameters, in the order of `Action`. Paper, section 6.2.
 ACTION_LOW = (0.0, 0.0, 0.0, 0.0)
 ACTION_HIGH = (0.7, 5.0, 0.7, 5.0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from jaxtyping import Array, Float
 
-from wlplan.constants import GRAVITY, J_PER_KJ, KG_PER_TONNE
+from wlplan.constants import DUMP_TIME, GRAVITY, J_PER_KJ, KG_PER_TONNE
 from wlplan.planning.driving import Room, Way
 from wlplan.planning.lane import lane_touching
 from wlplan.planning.loading import Transport
@@ -17,8 +17,6 @@ from wlplan.planning.way import way_to
 from wlplan.site.site import Site
 from wlplan.types import Pile, Pose
 
-# Dumping [s]: follow-up, 5 s without work.
-DUMP_TIME = 5.0
 # Each change between forward and reverse [s]. Estimate.
 SHIFT_TIME = 1.0
 

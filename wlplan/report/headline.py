@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from numbers import Real
 from typing import Any
 
-from wlplan.planning.transport import DUMP_TIME
+from wlplan.constants import DUMP_TIME
 
 # Diesel for the work of wheels and bucket [l/MJ]. Estimates: engines of the class burn 220 g for
 # each kWh, a litre has 0.84 kg, and 60 % of what the engine gives reaches wheels and bucket.
