@@ -7,6 +7,7 @@ what is always there, and `content(document, pile)`. They are imported when they
 from __future__ import annotations
 
 import importlib
+import pkgutil
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,9 @@ from wlplan.io.libraries import library
 if TYPE_CHECKING:
     from wlplan.types import Pile
 
-KINDS = ("geojson", "dxf", "geotiff")
+KINDS = tuple(
+    module.name for module in pkgutil.iter_modules(__path__) if not module.name.startswith("_")
+)
 """What there is, by the name of its module."""
 
 

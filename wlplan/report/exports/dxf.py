@@ -6,7 +6,7 @@ import io
 from collections.abc import Mapping
 from typing import Any
 
-from wlplan.report.exports import parts
+from wlplan.report.exports import _parts as parts
 from wlplan.types import Pile
 
 LIBRARY = "ezdxf"

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from wlplan.report.exports import parts
+from wlplan.report.exports import _parts as parts
 from wlplan.site.frame import frame_recorded
 from wlplan.types import Pile
 
