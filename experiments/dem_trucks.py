@@ -135,7 +135,7 @@ def draw(folder: Path) -> None:
     """Seconds a tonne of each plan in each world."""
     rows = json.loads((folder / "dem_trucks.json").read_text())["rows"]
     worlds = [name for name in ("model", "simulator", "discrete elements") if name in rows[0]]
-    figure = new_figure(6.0, 2.8)
+    figure = new_figure(8.0, 3.2)
     panel = figure.subplots()
     places = np.arange(len(rows))
     for shift, world, colour in zip(
@@ -143,9 +143,10 @@ def draw(folder: Path) -> None:
     ):
         values = [row[world]["seconds_a_tonne"] for row in rows]
         panel.bar(places + shift, values, 0.24, color=colour, label=world)
-    panel.set_xticks(places, [f"{row['pile']},\n{row['plan']}" for row in rows], fontsize=7)
+    names = [",\n".join([row["pile"], *row["plan"].split(", ")]) for row in rows]
+    panel.set_xticks(places, names, fontsize=7)
     panel.set_ylabel("digging and driving [s/t]", fontsize=8)
-    panel.legend(frameon=False, fontsize=8)
+    figure.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=8)
     tidy(panel)
     write_bytes_atomic(folder / "dem_trucks.png", png_bytes(figure))
 

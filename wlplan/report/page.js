@@ -81,7 +81,7 @@
     return { x: 1.6 * Math.cos(angle), y: 1.6 * Math.sin(angle), z: 1.1 };
   }
   const layout = {
-    margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "kept", showlegend: false,
+    margin: { l: 0, r: 0, t: 0, b: 0 }, paper_bgcolor: "rgba(0,0,0,0)", uirevision: "kept", showlegend: false,
     scene: { aspectmode: "data", camera: { eye: eye(), center: { x: 0, y: 0, z: -0.15 } },
       xaxis: axis(low[0], high[0], scene.offset[0], "x, east [m]"),
       yaxis: axis(low[1], high[1], scene.offset[1], "y, north [m]"),
