@@ -948,6 +948,13 @@ def test_what_is_exported_needs_a_folder(run: Run) -> None:
     assert "--out DIR" in err
 
 
+def test_discrete_elements_make_no_film(run: Run, tmp_path: Path) -> None:
+    words = ("--engine", "dem", "--also", "gif", "--out", tmp_path / "out")
+    code, _, err = run("simulate", "bundled", tmp_path / "plan.json", *words)
+    assert code == 2
+    assert "leave out --also gif" in err
+
+
 def test_the_report_stands_alone_and_escapes_names(run: Run, tmp_path: Path) -> None:
     name = "<b>&'x\".npz"
     path = tmp_path / name

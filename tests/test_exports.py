@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from cones import cone
 from ezdxf import filemanagement
+from PIL import Image
 
 from wlplan.errors import InputError
 from wlplan.io import read_pile
 from wlplan.report import exports
-from wlplan.report.exports import check, exported
+from wlplan.report.exports import Played, check, exported
+from wlplan.types import Pile
 
 OFFSET = [412000.0, 5310000.0, 200.0]
 LOADS: list[dict[str, Any]] = [
@@ -33,8 +35,26 @@ DOCUMENT: dict[str, Any] = {
 }
 
 
+def played(document: dict[str, Any], pile: Pile) -> Played:
+    heights = np.stack([np.asarray(pile.height) - 0.1, np.asarray(pile.height)])
+    return Played(document, pile, heights)
+
+
+def test_a_film_has_a_picture_before_each_load_and_one_of_the_end() -> None:
+    film = Image.open(io.BytesIO(exported(["gif"], played(DOCUMENT, cone()))["plan.gif"]))
+    assert film.n_frames == 3  # type: ignore[attr-defined]
+    assert film.info["loop"] == 0
+    frames = []
+    for n in range(3):
+        film.seek(n)
+        frames.append(np.asarray(film.convert("RGB"), int))
+    assert min(frames[0].shape[:2]) > 300
+    # The second has another heading, and the pile is 10 cm lower.
+    assert np.abs(frames[0] - frames[1]).max() > 100
+
+
 def test_geojson_has_digs_ways_and_the_truck_where_they_are() -> None:
-    content = exported(["geojson"], DOCUMENT, cone())["plan.geojson"]
+    content = exported(["geojson"], played(DOCUMENT, cone()))["plan.geojson"]
     found = json.loads(content)
     assert found["crs"]["properties"]["name"] == "EPSG:25832"
     kinds = [one["properties"]["kind"] for one in found["features"]]
@@ -57,11 +77,11 @@ def test_geojson_has_digs_ways_and_the_truck_where_they_are() -> None:
 
 def test_geojson_of_a_scan_without_a_reference_system_names_none() -> None:
     document = {**DOCUMENT, "frame": {"offset": OFFSET, "crs": None}}
-    assert "crs" not in json.loads(exported(["geojson"], document, cone())["plan.geojson"])
+    assert "crs" not in json.loads(exported(["geojson"], played(document, cone()))["plan.geojson"])
 
 
 def test_dxf_has_a_layer_for_each_kind_of_thing() -> None:
-    content = exported(["dxf"], DOCUMENT, cone())["plan.dxf"]
+    content = exported(["dxf"], played(DOCUMENT, cone()))["plan.dxf"]
     drawing = filemanagement.read(io.StringIO(content.decode()))
     assert not drawing.audit().has_errors
     assert drawing.header["$INSUNITS"] == 6
@@ -82,7 +102,7 @@ def test_geotiff_is_the_pile_that_is_left(tmp_path: Path) -> None:
     seen[:5, :40] = False
     pile = pile.replace(valid=jnp.asarray(seen), height=pile.height.at[100:110, 90:100].add(0.3))
     path = tmp_path / "pile_after.tif"
-    path.write_bytes(exported(["geotiff"], DOCUMENT, pile)[path.name])
+    path.write_bytes(exported(["geotiff"], played(DOCUMENT, pile))[path.name])
     again = read_pile(path)
     assert again.height.shape == pile.height.shape
     np.testing.assert_array_equal(np.asarray(again.valid), seen)

@@ -331,7 +331,7 @@ also_option = click.option(
     "--also",
     multiple=True,
     type=click.Choice(EXPORTS),
-    help="Write the plan as GeoJSON or DXF, or the pile after it as GeoTIFF, into the folder too; "
+    help="Write the plan as GeoJSON or DXF, the pile after it as GeoTIFF, or a film of it as GIF, too; "
     "may be given again.",
 )
 out_option = click.option(

@@ -257,6 +257,11 @@ def simulate(
     --seed changes nothing. If interrupted, the same command with --engine dem continues where it
     was.
     """
+    if engine == "dem" and "gif" in also:
+        raise InputError(
+            "discrete elements keep no pile between the loads: leave out --also gif, or play the "
+            "plan in the simulator."
+        )
     check_pile_name(pile_file.name)
     site_named(soil, machine)  # wrong options are refused before anything heavy is imported
 

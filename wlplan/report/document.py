@@ -265,7 +265,7 @@ def write_plan_folder(
     """
     from wlplan.io import write_bytes_atomic, write_plan
     from wlplan.report import figures
-    from wlplan.report.exports import exported
+    from wlplan.report.exports import Played, exported
     from wlplan.report.page import REPORT_NAME, write_report
     from wlplan.report.scene import scene_of
 
@@ -298,7 +298,10 @@ def write_plan_folder(
         scene=None if heights is None else scene_of(pile, heights, document),
         settings=settings,
     )
-    more = exported(also, document, simulated.rollout.pile)
+    if heights is None:
+        # Of the last load alone.
+        heights = np.asarray(simulated.rollout.pile.height)[None]
+    more = exported(also, Played(document, pile, heights))
     for name, content in more.items():
         write_bytes_atomic(folder / name, content)
     return [REPORT_NAME, "plan.json", "plan.png", "totals.png", *more]

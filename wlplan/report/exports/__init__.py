@@ -1,11 +1,12 @@
 """A plan in the files of other tools, in the coordinates of the scan.
 
 One file here for each kind, with `NAME`, the file that it makes, `LIBRARY`, what it needs beside
-what is always there, and `content(document, pile)`. They are imported when they are asked for.
+what is always there, and `content(played)`. They are imported when they are asked for.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import pkgutil
 from collections.abc import Mapping, Sequence
@@ -38,16 +39,36 @@ def check(kinds: Sequence[str]) -> None:
                 raise InputError(f"{kind}: {error}") from error
 
 
-def exported(kinds: Sequence[str], document: Mapping[str, Any], after: Pile) -> dict[str, bytes]:
+@dataclasses.dataclass(frozen=True)
+class Played:
+    """A plan that was played.
+
+    Attributes:
+        document: Content of its plan.json.
+        before: The pile before the first load, in the frame of the document.
+        heights: As each load leaves them, [n, nx, ny] in metres.
+    """
+
+    document: Mapping[str, Any]
+    before: Pile
+    heights: Any
+
+    @property
+    def after(self) -> Pile:
+        """The pile that is left."""
+        left: Pile = self.before.replace(height=self.heights[-1])
+        return left
+
+
+def exported(kinds: Sequence[str], played: Played) -> dict[str, bytes]:
     """Contents of files by name.
 
     Args:
         kinds: Of `KINDS`.
-        document: Content of a plan.json.
-        after: The pile that the plan leaves, in the frame of the document.
+        played: What they are to show.
     """
     modules = [_module(kind) for kind in dict.fromkeys(kinds)]
-    return {module.NAME: module.content(document, after) for module in modules}
+    return {module.NAME: module.content(played) for module in modules}
 
 
 def _module(kind: str) -> Any:

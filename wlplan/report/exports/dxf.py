@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
-from typing import Any
 
+from wlplan.report.exports import Played
 from wlplan.report.exports import _parts as parts
-from wlplan.types import Pile
 
 LIBRARY = "ezdxf"
 NAME = "plan.dxf"
@@ -18,25 +16,24 @@ _METRES = 6
 _TEXT = 0.4
 
 
-def content(document: Mapping[str, Any], after: Pile) -> bytes:
-    """The file; arguments as of `wlplan.report.exports.exported`."""
+def content(played: Played) -> bytes:
+    """The file."""
     from ezdxf import filemanagement
 
-    del after
     drawing = filemanagement.new("R2010", units=_METRES)
     for name, colour in LAYERS.items():
         drawing.layers.add(name, color=colour)
     space = drawing.modelspace()
-    for number, _, line in parts.digs(document):
+    for number, _, line in parts.digs(played.document):
         start, tip = (tuple(map(float, point)) for point in line)
         space.add_point(tip, dxfattribs={"layer": "DIGS"})
         text = {"layer": "DIGS", "height": _TEXT}
         space.add_text(str(number), dxfattribs=text).set_placement(tip)
         space.add_line(start, tip, dxfattribs={"layer": "APPROACH"})
-    for _, name, points in parts.legs(document):
+    for _, name, points in parts.legs(played.document):
         layer = {"layer": f"WAY_{name.upper()}"}
         space.add_lwpolyline([tuple(map(float, point)) for point in points], dxfattribs=layer)
-    for _, corners in parts.trucks(document):
+    for _, corners in parts.trucks(played.document):
         ring = [tuple(map(float, corner)) for corner in corners]
         space.add_lwpolyline(ring, close=True, dxfattribs={"layer": "TRUCKS"})
     buffer = io.StringIO()

@@ -7,14 +7,13 @@ QGIS read it, though RFC 7946 knows longitude and latitude alone: a site is stak
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from wlplan.report.exports import Played
 from wlplan.report.exports import _parts as parts
 from wlplan.site.frame import frame_recorded
-from wlplan.types import Pile
 
 LIBRARY: str | None = None
 NAME = "plan.geojson"
@@ -22,22 +21,21 @@ NAME = "plan.geojson"
 _DIGITS = 3
 
 
-def content(document: Mapping[str, Any], after: Pile) -> bytes:
-    """The file; arguments as of `wlplan.report.exports.exported`."""
-    del after
+def content(played: Played) -> bytes:
+    """The file."""
     features = []
-    for number, load, line in parts.digs(document):
+    for number, load, line in parts.digs(played.document):
         facts = {"load": number, "heading_deg": round(float(np.degrees(load["heading"])), 1)}
         for name, value in (load.get("simulated") or {}).items():
             facts[name] = round(value, _DIGITS)
         features.append(_feature("Point", line[1], kind="dig", **facts))
         features.append(_feature("LineString", line, kind="approach", load=number))
-    for number, name, points in parts.legs(document):
+    for number, name, points in parts.legs(played.document):
         features.append(_feature("LineString", points, kind=f"way, {name}", load=number))
-    for name, corners in parts.trucks(document):
+    for name, corners in parts.trucks(played.document):
         ring = np.concatenate([corners, corners[:1]])
         features.append(_feature("Polygon", ring[None], kind="truck", name=name))
-    crs = frame_recorded(document).crs
+    crs = frame_recorded(played.document).crs
     named = {"crs": {"type": "name", "properties": {"name": crs}}} if crs else {}
     return json.dumps(
         {"type": "FeatureCollection", **named, "features": features}, allow_nan=False

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
+from wlplan.report.exports import Played
 from wlplan.site.frame import frame_recorded
-from wlplan.types import Pile
 
 LIBRARY = "rasterio"
 NAME = "pile_after.tif"
 _UNSEEN = -9999.0
 
 
-def content(document: Mapping[str, Any], after: Pile) -> bytes:
-    """The file; arguments as of `wlplan.report.exports.exported`. What was not seen has no data."""
+def content(played: Played) -> bytes:
+    """The file. What was not seen has no data."""
     import rasterio
 
+    document, after = played.document, played.after
     frame, size = frame_recorded(document), after.cell_size
     height = np.asarray(after.height, np.float64) + frame.offset[2]
     if after.valid is not None:
