@@ -331,8 +331,8 @@ also_option = click.option(
     "--also",
     multiple=True,
     type=click.Choice(EXPORTS),
-    help="Write the plan as GeoJSON or DXF, the pile after it as GeoTIFF, or a film of it as GIF, too; "
-    "may be given again.",
+    help="Write the plan as GeoJSON or DXF, the pile after it as GeoTIFF, or a film of it as GIF, "
+    "too; may be given again.",
 )
 out_option = click.option(
     "--out", metavar="DIR", default=None, help="Folder to write to. It is made if it is missing."

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
 from wlplan.constants import QUANTITIES
@@ -25,7 +25,8 @@ from wlplan.site.frame import LOCAL, Frame
 from wlplan.studies.diggability import DiggabilityMap
 from wlplan.types import Pile
 
-_COLOURS = colormaps["viridis"]
+# Yellow is good in every map: much mass, little time and work.
+_MUCH_IS_GOOD, _LITTLE_IS_GOOD = colormaps["viridis"], colormaps["viridis_r"]
 # Length of the line that marks a location [m]; at most this part of the view.
 _TICK = 1.5
 _TICK_PART = 0.09
@@ -35,7 +36,7 @@ def diggability_figure(pile: Pile, diggability: DiggabilityMap, *, frame: Frame 
     """Mass, time and work of one action at locations around the pile.
 
     The colours of the lines, which stand on the toe along the inward normals, are those of the
-    histograms below.
+    histograms below. Yellow is good: much mass, little time and work.
 
     Args:
         pile: The pile the map was made for.
@@ -60,10 +61,11 @@ def diggability_figure(pile: Pile, diggability: DiggabilityMap, *, frame: Frame 
         values = np.asarray(getattr(diggability.performance, name), float)
         edges = _bins(values)
         scale = Normalize(edges[0], edges[-1])
+        colours = _MUCH_IS_GOOD if name == "mass" else _LITTLE_IS_GOOD
         draw_pile(panel, pile, STONE, norm, contour_alpha=0.35)
         frame_map(panel, view, f"{label} [{unit}]", frame)
-        _draw_ticks(panel, ticks, scale(values))
-        _draw_histogram(histogram, values, edges, scale)
+        _draw_ticks(panel, ticks, colours(scale(values)))
+        _draw_histogram(histogram, values, edges, scale, colours)
         histogram.set_title(
             f"median {np.median(values):.3g} {unit}, {values.min():.3g} to {values.max():.3g}",
             fontsize=9,
@@ -78,11 +80,10 @@ def diggability_figure(pile: Pile, diggability: DiggabilityMap, *, frame: Frame 
 
 
 def _draw_ticks(
-    panel: Axes, ticks: Float[np.ndarray, "n 2 2"], shades: Float[np.ndarray, " n"]
+    panel: Axes, ticks: Float[np.ndarray, "n 2 2"], colours: Float[np.ndarray, "n 4"]
 ) -> None:
-    """Lines from point to point [m] on a map, coloured by shades from 0 to 1, on white ones."""
-    colours = [tuple(colour) for colour in _COLOURS(shades)]
-    for colour, width, zorder in (("white", 4.2, 4), (colours, 2.8, 5)):
+    """Lines from point to point [m] on a map, each in its colour, on white ones."""
+    for colour, width, zorder in (("white", 4.2, 4), (list(colours), 2.8, 5)):
         panel.add_collection(
             LineCollection(
                 list(ticks), colors=colour, linewidths=width, capstyle="round", zorder=zorder
@@ -91,12 +92,16 @@ def _draw_ticks(
 
 
 def _draw_histogram(
-    panel: Axes, values: Float[np.ndarray, " n"], edges: Float[np.ndarray, " m"], scale: Normalize
+    panel: Axes,
+    values: Float[np.ndarray, " n"],
+    edges: Float[np.ndarray, " m"],
+    scale: Normalize,
+    colours: Colormap,
 ) -> None:
     """How many values lie between the edges, in their colours, and the median as a line."""
     count, _ = np.histogram(values, edges)
     middle = 0.5 * (edges[1:] + edges[:-1])
-    panel.bar(middle, count, width=np.diff(edges), color=_COLOURS(scale(middle)), edgecolor="white")
+    panel.bar(middle, count, width=np.diff(edges), color=colours(scale(middle)), edgecolor="white")
     panel.axvline(float(np.median(values)), color=INK, linewidth=1.0, linestyle=":")
     panel.locator_params(axis="y", integer=True)
     tidy(panel)
