@@ -384,7 +384,7 @@ def draw(folder: Path) -> None:
                     )
             panel.axhline(0.0, color=FAINT, lw=0.8)
             panel.set_xscale("log")
-            panel.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0)))
+            panel.xaxis.set_major_locator(LogLocator(10.0, (1.0, 3.0)))
             panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
             panel.xaxis.set_minor_formatter(NullFormatter())
             low, high = panel.get_ylim()
