@@ -120,6 +120,7 @@ def plan(
         progress.phase(f"reading {pile_file.name}")
         named = pile_named(pile_file, site.machine)
         pile = named.pile
+        progress.phase("loading the models")
         world = world_named(world_name, site, model, pile_state)
         simulator = world_named("simulator", site)
         wanted = amount()
