@@ -49,7 +49,7 @@ $(VENV)/.engine: $(VENV)/.tools
 
 demo: $(VENV)/.package
 	$(BIN)/wlplan plan --loads $(LOADS) --world hybrid --out demo
-	@echo "pictures: demo/plan.png and demo/totals.png; both and all numbers: demo/report.html"
+	@echo "open demo/report.html: the job, the pile load by load, pictures and all numbers"
 
 test: $(VENV)/.tools
 	$(BIN)/python -m pytest
