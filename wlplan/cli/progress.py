@@ -114,7 +114,8 @@ class Progress:
     def _tell_now_and_then(self) -> None:
         """A line whenever nothing was told for a while."""
         while not self._done.wait(_PAUSE):
-            quiet = all(time.monotonic() - told > _PAUSE for told in self._told.values())
+            # A copy: the other thread adds stages meanwhile.
+            quiet = all(time.monotonic() - told > _PAUSE for told in tuple(self._told.values()))
             if quiet and self._phase and not self._done.is_set():
                 print(self.now(), file=sys.stderr, flush=True)
 
