@@ -76,7 +76,7 @@ def _times(job: Job, planner: Greedy, loads: int, plans: int, repeats: int) -> d
     outlook, _ = planner.outlook(job, standing, tried, watch)
     looks = processor(lambda: planner.attempt(job, standing, np.random.default_rng(1), watch).costs)
     positions = tried.poses[:: planner.neighbours * len(planner.offsets), 0]
-    quick = processor(lambda: quick_ways(job, job.pile, positions, batch=8)) / len(positions)
+    quick = processor(lambda: quick_ways(job, job.pile, positions)) / len(positions)
     refined = planner.refined * planner.refine_steps
     refine = processor(lambda: planner.best(job, standing, tried, outlook, watch).scores)
     return {

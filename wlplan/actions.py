@@ -36,4 +36,6 @@ def latin_hypercube(
 
 def spread_actions(count: int, random: np.random.Generator, dtype: np.dtype) -> Float[Array, "n 4"]:
     """Actions, before squashing, that fill the box evenly."""
-    return jnp.asarray(unsquash(latin_hypercube(count, 4, random)), dtype)
+    # `jnp.asarray` would compile for each shape.
+    actions: Array = jax.device_put(unsquash(latin_hypercube(count, 4, random)).astype(dtype))
+    return actions

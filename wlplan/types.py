@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, no_type_check
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -26,7 +27,10 @@ def _as_arrays(node: Any, *names: str) -> None:
     """Turns numpy arrays, lists and tuples among fields into arrays; leaves all else untouched."""
     for name in names:
         value = getattr(node, name)
-        if isinstance(value, np.ndarray | list | tuple):
+        if isinstance(value, np.ndarray):
+            # `jnp.asarray` would compile for each shape.
+            object.__setattr__(node, name, jax.device_put(value))
+        elif isinstance(value, list | tuple):
             object.__setattr__(node, name, jnp.asarray(value))
 
 

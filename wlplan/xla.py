@@ -6,8 +6,10 @@ slowest member; but each of its cores can run one. Of several devices each takes
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -33,10 +35,15 @@ class ParallelMap:
 
     Args:
         function: Pure function of two pytrees: what all rows share, and one row.
+        on_core: The same for a row on a core, not compiled as a whole; None: `function`, compiled.
     """
 
-    def __init__(self, function: Callable[[Any, Any], Any]):
-        self._one = jax.jit(function)
+    def __init__(
+        self,
+        function: Callable[[Any, Any], Any],
+        on_core: Callable[[Any, Any], Any] | None = None,
+    ):
+        self._one = jax.jit(function) if on_core is None else on_core
         self._function = function
         self._ran: set[Any] = set()
 
@@ -52,8 +59,11 @@ class ParallelMap:
         """
         if jax.default_backend() != "cpu" or jax.local_device_count() > 1:
             return self._over_devices(shared, rows)
-        count = len(jax.tree.leaves(rows)[0])
-        members = [jax.tree.map(lambda leaf, k=k: leaf[k], rows) for k in range(count)]
+        tree: Any
+        leaves, tree = jax.tree.flatten(rows)
+        # By numpy, as below: what picks a row would be compiled for each shape.
+        leaves, count = [np.asarray(leaf) for leaf in leaves], len(leaves[0])
+        members = [tree.unflatten(leaf[k] for leaf in leaves) for k in range(count)]
         results = []
         kind = _kind(shared, members[0])
         if kind not in self._ran:
@@ -96,6 +106,35 @@ class ParallelMap:
         return jax.jit(on_each)
 
 
+class Ahead:
+    """Has something compiled in a thread of its own, while there is other work.
+
+    Who needs it waits, since what two threads ask for at once is compiled twice.
+    """
+
+    def __init__(self) -> None:
+        self._thread: threading.Thread | None = None
+
+    def run(self, call: Callable[[], Any]) -> None:
+        """Calls what compiles as it is called; what goes wrong there goes wrong later, in turn."""
+        self.wait()
+        double = jnp.zeros(()).dtype == np.float64
+
+        def quietly() -> None:
+            with contextlib.suppress(Exception), jax.enable_x64(double):
+                call()
+
+        self._thread = threading.Thread(target=quietly, daemon=True)
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Until that is done; not in the thread itself."""
+        thread = self._thread
+        if thread is not None and thread is not threading.current_thread():
+            thread.join()
+            self._thread = None
+
+
 def materialize_if(values: PyTree, wanted: Bool[Array, ""], *, otherwise: float = 0.0) -> PyTree:
     """Have XLA store arrays instead of computing them anew in each operation that uses them.
 
@@ -129,9 +168,15 @@ def materialize(values: PyTree, source: Float[Array, ""]) -> PyTree:
     return materialize_if(values, source == source, otherwise=float("nan"))
 
 
+def on_device(values: np.ndarray | np.generic) -> Array:
+    """An array of numpy's as one of JAX's; `jnp.asarray` would compile for each shape."""
+    array: Array = jax.device_put(values)
+    return array
+
+
 def floats(values: np.ndarray) -> Array:
     """float32, or float64 under `jax_enable_x64`, without a warning from the conversion."""
-    return jnp.asarray(values.astype(jnp.zeros(()).dtype))
+    return on_device(values.astype(jax.dtypes.canonicalize_dtype(float)))
 
 
 def cores() -> int:

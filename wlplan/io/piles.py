@@ -25,6 +25,7 @@ from wlplan.io.files import write_bytes_atomic
 from wlplan.io.survey import read_survey
 from wlplan.site.frame import Frame
 from wlplan.types import Pile
+from wlplan.xla import on_device
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,11 +118,11 @@ def read_scan(
     survey = read_survey(path, ground=read, dtype=jnp.zeros(()).dtype, **options)
     grid = survey.grid
     pile = Pile(
-        height=jnp.asarray(grid.height),
+        height=on_device(grid.height),
         cell_size=grid.cell_size,
-        origin=jnp.asarray(grid.origin),
-        ground=None if grid.ground is None else jnp.asarray(grid.ground),
-        valid=None if grid.valid is None else jnp.asarray(grid.valid),
+        origin=on_device(grid.origin),
+        ground=None if grid.ground is None else on_device(grid.ground),
+        valid=None if grid.valid is None else on_device(grid.valid),
     )
     return ScannedPile(pile, survey.frame, survey.notes, survey.contents, survey.scanned_cell)
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, no_type_check
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx, struct
 from jaxtyping import Array, Float
 
@@ -68,7 +69,8 @@ class PerformanceModel(struct.PyTreeNode, abc.ABC):
     def faces_seen(self) -> tuple[Characteristics, Characteristics]:
         """The least and the largest characteristics of the training data."""
         count = len(dataclasses.fields(Characteristics))
-        ends = self.inputs.low, self.inputs.low + self.inputs.span
+        first, span = np.asarray(self.inputs.low), np.asarray(self.inputs.span)
+        ends = first, first + span
         low, high = (Characteristics(*(float(value) for value in end[:count])) for end in ends)
         return low, high
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
@@ -32,6 +31,7 @@ from wlplan.models.phi_vae import PhiVae, VaePileStateModel
 from wlplan.models.psi_high import HighPerformanceModel, PsiHigh
 from wlplan.models.psi_low import LowPerformanceModel, PsiLow
 from wlplan.models.stall import StallModel, StallNetwork
+from wlplan.xla import on_device
 
 MODEL_FORMAT = "wlplan.model/1"
 
@@ -203,7 +203,7 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
         # A damaged description makes anything fail; to the user it means the same.
         what = one_line(error)
         raise InputError(f"{directory}: is damaged ({what}): copy or train it again.") from error
-    nnx.replace_by_pure_dict(params, jax.tree.map(jnp.asarray, weights))
+    nnx.replace_by_pure_dict(params, jax.tree.map(on_device, weights))
     model = _KINDS[kind].model(params=params, graph=graph, **normalisers)
     return Ensemble(model, factor) if members else model
 
@@ -274,7 +274,7 @@ def _normaliser_of_dict(record: Mapping[str, Any], size: int) -> Normaliser:
     parts = [np.array(record[name], np.float32) for name in ("low", "span")]
     if any(part.shape != (size,) or not np.isfinite(part).all() for part in parts):
         raise ValueError("the normaliser does not fit")
-    return Normaliser(*(jnp.asarray(part) for part in parts))
+    return Normaliser(*map(on_device, parts))
 
 
 def _ensemble_to_dict(ensemble: Ensemble) -> dict[str, Any]:
@@ -284,11 +284,11 @@ def _ensemble_to_dict(ensemble: Ensemble) -> dict[str, Any]:
 def _ensemble_of_dict(record: Mapping[str, Any] | None) -> tuple[int, jax.Array]:
     """Number of members, 0 of a model that is no ensemble, and their factors."""
     if record is None:
-        return 0, jnp.ones(3)
+        return 0, on_device(np.ones(3, np.float32))
     factor = np.array(record["factor"], np.float32)
     if record["members"] < 2 or factor.shape != (3,) or not (factor > 0.0).all():
         raise ValueError("the record of the ensemble makes no sense")
-    return int(record["members"]), jnp.asarray(factor)
+    return int(record["members"]), on_device(factor)
 
 
 def _of_grid(record: Any) -> str:

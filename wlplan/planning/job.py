@@ -25,6 +25,7 @@ from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour, toe_contour
 from wlplan.types import Action, LoadingPlan, Pile, Pose, World
 from wlplan.worlds.capabilities import FORESIGHT, as_pytree, can, is_differentiable
+from wlplan.xla import on_device
 
 # As many loads as a plan has rows.
 _AS_GIVEN = Loads(2**30)
@@ -157,13 +158,19 @@ def decided(job: Job, standing: Standing, one: Decisions | LoadingPlan) -> Loadi
 def contour_length(job: Job) -> Float[Array, ""]:
     """Length of the toe contour [m]."""
     assert job.toe is not None
-    steps = job.toe.points[1:] - job.toe.points[:-1]
+    length: Array = _length(job.toe.points)
+    return length
+
+
+@jax.jit
+def _length(points: Float[Array, "n 2"]) -> Float[Array, ""]:
+    steps = points[1:] - points[:-1]
     return jnp.sqrt((steps**2).sum(axis=1)).sum()
 
 
 def stacked(decisions: Sequence[Decisions]) -> Decisions:
-    """Several decisions as one, with a new leading axis."""
-    together: Decisions = jax.tree.map(lambda *leaves: jnp.stack(leaves), *decisions)
+    """Several decisions as one, with a new leading axis; by numpy, which compiles nothing."""
+    together: Decisions = jax.tree.map(lambda *leaves: on_device(np.stack(leaves)), *decisions)
     return together
 
 
@@ -237,4 +244,5 @@ def padded(chosen: Sequence[Decisions], rows: int) -> Decisions:
     at = np.minimum(np.arange(rows), len(chosen) - 1)
     full: Decisions = jax.tree.map(lambda leaf: leaf[at], plan)
     assert full.truck is not None
-    return full.replace(truck=jnp.where(jnp.arange(rows) < len(chosen), full.truck, -1))
+    trucks = np.where(np.arange(rows) < len(chosen), full.truck, -1).astype(np.int32)
+    return full.replace(truck=trucks)

@@ -15,11 +15,13 @@ from jaxtyping import Array, Float, Int
 from wlplan.actions import spread_actions
 from wlplan.planning.amounts import Outlook, Trucks
 from wlplan.planning.descent import descend
+from wlplan.planning.good_ways import good_ways
 from wlplan.planning.job import Decisions, Job, Standing, beginning, can_refine, contour_length
+from wlplan.planning.poses import Toe, pose_at
 from wlplan.planning.search import Cusps
-from wlplan.planning.stepping import cusps_of_next, next_load, score_of, score_of_next
+from wlplan.planning.stepping import next_load, score_of, score_of_next
 from wlplan.planning.watch import Watch
-from wlplan.types import Pile
+from wlplan.types import Pile, Pose
 from wlplan.xla import ParallelMap, floats
 
 
@@ -125,7 +127,7 @@ class LoadSearch:
             kept = np.concatenate([np.asarray(actions)[len(known) :], known])[-self.actions :]
             actions = jnp.asarray(kept.astype(dtype))
         searched = positions[:: self.neighbours].astype(dtype)
-        cusps = quick_ways(job, standing.pile, searched, batch=self.batch // self.actions)
+        cusps = quick_ways(job, standing.pile, searched)
         of_pose = np.arange(len(poses)) // (self.neighbours * len(self.offsets))
         cusps = jax.tree.map(lambda leaf: leaf[of_pose], cusps)
         costs, masses = self._costs(job, standing, poses, cusps, actions)
@@ -183,9 +185,9 @@ class LoadSearch:
         # One start a pose, so that refinement does not begin in the same place eight times.
         rows = np.argsort(scores.min(axis=1))[: self.refined]
         starts = Decisions(
-            position=jnp.asarray(tried.poses[rows, 0]),
-            offset=jnp.asarray(tried.poses[rows, 1]),
-            action=tried.actions[scores.argmin(axis=1)[rows]],
+            position=tried.poses[rows, 0],
+            offset=tried.poses[rows, 1],
+            action=np.asarray(tried.actions)[scores.argmin(axis=1)[rows]],
         )
         cusps = jax.tree.map(lambda leaf: leaf[rows], tried.cusps)
         if not can_refine(job, self.refine_steps):
@@ -253,12 +255,7 @@ def _costs_at_poses(
     return jax.vmap(at_pose)(*at)
 
 
-def _cusps_of_some(shared: tuple[Job, Pile], positions: Float[Array, " p"]) -> Cusps:
-    job, pile = shared
-    return jax.vmap(lambda at: cusps_of_next(job, pile, at, jnp.zeros_like(at)))(positions)
-
-
-_costs_of_portions, _cusps_of_portions = ParallelMap(_costs_at_poses), ParallelMap(_cusps_of_some)
+_costs_of_portions = ParallelMap(_costs_at_poses)
 
 
 def _portions(count: int, size: int) -> Int[np.ndarray, "portions size"]:
@@ -272,14 +269,25 @@ def _portions(count: int, size: int) -> Int[np.ndarray, "portions size"]:
     return rows
 
 
-def quick_ways(job: Job, pile: Pile, positions: Float[np.ndarray, " p"], *, batch: int) -> Cusps:
-    """Cusps of good ways from positions along the toe, square to it, so many at once."""
-    rows = _portions(len(positions), max(1, batch))
-    found = _cusps_of_portions((job, pile), positions[rows])
-    joined: Cusps = jax.tree.map(
-        lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:])[: len(positions)], found
+def quick_ways(job: Job, pile: Pile, positions: Float[np.ndarray, " p"]) -> Cusps:
+    """Cusps of good ways from positions along the toe, square to it."""
+    assert job.toe is not None
+    # By portions, as below.
+    rows = _portions(len(positions), 32).ravel()
+    poses = jax.tree.map(
+        lambda leaf: np.asarray(leaf)[: len(positions)],
+        _square_to_toe(job.toe, pile, positions[rows]),
     )
-    return joined
+    receivers = jax.tree.map(
+        lambda leaf: np.broadcast_to(leaf, len(positions)), job.site.placed_receiver
+    )
+    return good_ways(pile, job.yard, job.site.machine, poses, receivers).cusps
+
+
+@jax.jit
+def _square_to_toe(toe: Toe, pile: Pile, positions: Float[Array, " p"]) -> Pose:
+    poses: Pose = jax.vmap(lambda at: pose_at(toe, pile, at, jnp.zeros_like(at)))(positions)
+    return poses
 
 
 class _Load(NamedTuple):

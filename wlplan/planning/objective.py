@@ -64,8 +64,16 @@ class Objective:
 
         Names of terms -> names in `wlplan.worlds.capabilities.FORESIGHT`.
         """
-        asked = ((name, getattr(_function(term), "needs", None)) for name, _, term in self._terms)
-        return {name: need for name, need in asked if need is not None}
+        found: dict[str, str] = {}
+        for name, _, term in self._terms:
+            needs = getattr(_function(term), "needs", {})
+            found |= {name: needs} if isinstance(needs, str) else needs
+        return found
+
+    @property
+    def asks_world(self) -> bool:
+        """Whether a term may look at the world: one that does, or a function of a user's."""
+        return any(_asks_world(_function(term)) for _, _, term in self._terms)
 
     def values(self, loading: Loading) -> dict[str, Float[Array, ""]]:
         """Each term of a loading without its weight; of a constraint the violation, never < 0.
@@ -122,6 +130,12 @@ def _term(name: str, value: Any) -> tuple[float, Term | Constraint]:
 
 def _function(term: Any) -> Any:
     return term.violation if isinstance(term, Constraint) else term
+
+
+def _asks_world(function: Any) -> bool:
+    if isinstance(function, Objective):
+        return function.asks_world
+    return hasattr(function, "needs") or function not in TERMS.values()
 
 
 def _value(name: str, term: Term | Constraint, loading: Loading) -> Array:

@@ -13,10 +13,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from wlplan.errors import InputError
-from wlplan.planning.driving import Room, room_of
-from wlplan.planning.lane import lane_touching
+from wlplan.planning.good_ways import good_ways
 from wlplan.planning.truck_area import nearest_of, places_inside, stands_inside
-from wlplan.planning.way import open_length, way_to
+from wlplan.planning.way import open_length
 from wlplan.planning.yard import yard_of
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.site.machine import WA320, WheelLoader
@@ -28,7 +27,6 @@ from wlplan.terrain.heightmap import sample
 from wlplan.terrain.standing import CLEARED, standing
 from wlplan.terrain.toe import ToeContour, edge_poses, toe_contour
 from wlplan.types import Pile, Pose
-from wlplan.xla import ParallelMap
 
 # Farthest that a receiver may be from the middle of the map [m].
 _FARTHEST = 500.0
@@ -48,9 +46,9 @@ _FURTHER = ((13.0, 6.0, 90.0), (16.0, 4.0, 105.0))
 # What a metre of way through an obstacle, and the part of the truck that stands on something or
 # where the scan saw nothing, are worth in metres of way.
 _TOUCHING, _TRUCK_ON, _TRUCK_UNSEEN = 20.0, 40.0, 2.0
-# Places that are judged at once, and by one core; and by how much the ways in the open may be
-# longer than they have to be [m].
-_BATCH, _PORTION, _SLACK = 32, 8, 0.5
+# Places that are judged at once, and by how much the ways in the open may be longer than they have
+# to be [m].
+_BATCH, _SLACK = 32, 0.5
 
 
 Closed: TypeAlias = Bool[ArrayLike, "nx ny"] | None
@@ -268,23 +266,24 @@ def _best(
     poses = poses[_yields(poses, pile, machine)]
     apart = np.hypot(*(places[:, None, :2] - poses[None, :, :2]).transpose(2, 0, 1))
     nearest = poses[np.argsort(apart, axis=1)[:, :_NEAREST]]
-    room = room_of(yard_of(pile, machine, closed), pile)
-    dtype = pile.height.dtype
-    at, digs_of = jnp.asarray(places, dtype), jnp.asarray(nearest, dtype)
+    yard, dtype = yard_of(pile, machine, closed), pile.height.dtype
     truck = cost_of_truck(places, pile, machine, closed)
     # The shortest ways come first: once one is found, most of the others need no look.
-    lengths = np.asarray(way_lengths(at, digs_of, machine))
+    lengths = way_lengths(places.astype(dtype), nearest.astype(dtype), machine)
+    lengths = np.asarray(lengths)
     bound = np.sort(lengths, axis=1)[:, :_BEST].mean(axis=1) + truck
     order = np.argsort(bound)
     order = np.concatenate([order, np.repeat(order[-1:], -len(order) % _BATCH)])
     best, least = 0, np.inf
-    site = Site(machine=machine)
     for part in order.reshape(-1, _BATCH):
         if bound[part[0]] - _SLACK > least:
             break
-        rows = part.reshape(-1, _PORTION)
-        ways = np.asarray(_mean_ways((pile, room, site), (at[rows], digs_of[rows]))).ravel()
-        cost = ways + truck[part]
+        receivers = Receiver(*places[part].repeat(nearest.shape[1], axis=0).T.astype(dtype))
+        ends = Pose(*nearest[part].reshape(-1, 3).T.astype(dtype)), receivers
+        found = good_ways(pile, yard, machine, *ends)
+        ways = found.length + _TOUCHING * found.touching
+        ways = np.sort(ways.reshape(len(part), -1), axis=1)[:, :_BEST]
+        cost = ways.mean(axis=1) + truck[part]
         if cost.min() < least:
             best, least = int(part[cost.argmin()]), float(cost.min())
     chosen: np.ndarray = places[best]
@@ -301,10 +300,16 @@ def _yields(
     c, s = np.cos(poses[:, 2, None, None]), np.sin(poses[:, 2, None, None])
     x = poses[:, 0, None, None] + ahead * c - left * s
     y = poses[:, 1, None, None] + ahead * s + left * c
-    above = np.asarray(sample(pile.height - pile.floor, pile, jnp.asarray(x), jnp.asarray(y)))
+    above = np.asarray(_above(pile, *(axis.astype(pile.height.dtype) for axis in (x, y))))
     soil = above.mean(axis=(1, 2))
     enough: np.ndarray = soil >= _WORTH * np.median(soil)
     return enough
+
+
+@jax.jit
+def _above(pile: Pile, x: Float[Array, "*n"], y: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Height of the surface over the ground at places [m]."""
+    return sample(pile.height - pile.floor, pile, x, y)
 
 
 @functools.partial(jax.jit, static_argnames="machine")
@@ -317,26 +322,6 @@ def way_lengths(
         return open_length(Pose(*at), Receiver(*place), machine)
 
     return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(places, poses)
-
-
-def _mean_ways_of(
-    shared: tuple[Pile, Room, Site], some: tuple[Float[Array, "n 3"], Float[Array, "n m 3"]]
-) -> Float[Array, " n"]:
-    """What the ways from the best of some poses to receivers cost in the mean [m]."""
-    pile, room, site = shared
-    machine = site.machine
-
-    def one(place: Array, at: Array) -> Array:
-        pose, receiver = Pose(*at), Receiver(*place)
-        length, touching, _ = way_to(pose, receiver, room, machine, thorough=False)
-        lane = lane_touching(pose, receiver, pile, room.yard, machine)
-        return length + _TOUCHING * (touching + lane)
-
-    ways = jax.vmap(jax.vmap(one, in_axes=(None, 0)))(*some)
-    return jnp.sort(ways, axis=1)[:, :_BEST].mean(axis=1)
-
-
-_mean_ways = ParallelMap(_mean_ways_of)
 
 
 def truck_cells(

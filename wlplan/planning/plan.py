@@ -30,6 +30,8 @@ from wlplan.planning.playing import (
     PlanResult,
     assemble,
     assess,
+    compile_ahead,
+    counting,
     joined,
     leaves_after,
     outcomes,
@@ -138,6 +140,9 @@ def plan_loads(
         try:
             with watch.ending():
                 of_part = with_toe(of_part, None if parts else contour)
+                if not parts:
+                    judge = () if checked is None else (checked,)
+                    compile_ahead(of_part, (*judge, job.world))
                 if each or (truck == "auto" and not parts):
                     place = best_place(of_part, site, rows, seed=seed, watch=watch)
                     job, of_part = at_receiver(job, place), at_receiver(of_part, place)
@@ -355,7 +360,7 @@ def _play_load_by_load(
     for n in range(len(plan.pose.x)):
         one, last = jax.tree.map(lambda leaf, n=n: leaf[n], (plan, leaves))
         after, performance, what = play_one(standing.pile, one.pose, one.action, note)
-        loading, done = assess(job, standing, one, performance, leaves=last)
+        loading, done = assess(counting(job), standing, one, performance, leaves=last)
         loadings.append(loading)
         standing = Standing(after, done)
         record(n + 1, what)
@@ -363,4 +368,4 @@ def _play_load_by_load(
 
 
 def _member(batch: Any, k: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[k], batch)
+    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[k]), batch)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, no_type_check
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from wlplan.planning.amounts import MISFIT_COST, Done
+from wlplan.planning.amounts import MISFIT_COST, Done, Loads
 from wlplan.planning.driving import Way, room_of
 from wlplan.planning.job import Decisions, Job, Standing, beginning, decided
 from wlplan.planning.loading import Loading, Transport
@@ -23,9 +24,17 @@ from wlplan.planning.yard import packed_soil
 from wlplan.site.receiver import Receiver
 from wlplan.terrain.characteristics import characteristics
 from wlplan.terrain.heightmap import sample_local
-from wlplan.types import Characteristics, LoadingPlan, Performance, Rollout, SolveReport
-from wlplan.worlds.capabilities import can
-from wlplan.xla import ParallelMap
+from wlplan.types import (
+    Characteristics,
+    LoadingPlan,
+    Performance,
+    Pile,
+    Rollout,
+    SolveReport,
+    World,
+)
+from wlplan.worlds.capabilities import FORESIGHT, can
+from wlplan.xla import Ahead, ParallelMap, on_device
 
 
 @no_type_check
@@ -94,6 +103,7 @@ OF_LOADS = (
 """Fields of a result, beside plan and performance, whose leaves have an axis of loads."""
 
 
+@functools.partial(jax.jit, static_argnames="thorough")
 def assess(
     job: Job,
     standing: Standing,
@@ -105,6 +115,9 @@ def assess(
     thorough: bool = True,
 ) -> tuple[Assessed, Done]:
     """Transport, terms and cost of one loading, and what is done after it.
+
+    It is traced once for all programs that it is a part of: so give it no more of a job than it
+    needs, see `counting`.
 
     Args:
         job: Site, objective and amount.
@@ -134,14 +147,18 @@ def assess(
     return Assessed(one, performance, carried, terms, misfit, cost, face, ways), done
 
 
-def assemble(
-    job: Job,
-    loadings: Assessed,
-    last: Standing,
-    solves: SolveReport | None = None,
-    stall_probability: Array | None = None,
-    deviation: Performance | None = None,
-) -> PlanResult:
+class Known(NamedTuple):
+    """What a world says of a loading beside its performance; None where it says nothing."""
+
+    solves: SolveReport | None = None
+    stall_probability: Array | None = None  # [1]
+    deviation: Performance | None = None  # of the error, standard [tonne, s, kJ]
+
+
+_NOTHING = Known()
+
+
+def assemble(job: Job, loadings: Assessed, last: Standing, known: Known = _NOTHING) -> PlanResult:
     """Loadings in order, leaves with leading axis N, and where the last leaves the job."""
     missing = job.amount.missing(last.done)
     return PlanResult(
@@ -155,9 +172,7 @@ def assemble(
         missing=missing,
         faces=loadings.face,
         ways=loadings.ways,
-        solves=solves,
-        stall_probability=stall_probability,
-        deviation=deviation,
+        **known._asdict(),
     )
 
 
@@ -178,32 +193,106 @@ def play_candidate(
         report: Whether to look at how the world's solvers ended and how likely loads stall, where
             it says so.
     """
-    solve = getattr(job.world, "solve", None) if report else None
-    play: Callable[..., Any] = job.world if solve is None else solve
-    world: Any = job.world
-    foreseen = [
-        getattr(world, name) if report and can(world, name) else None
-        for name in ("stall_probability", "uncertainty")
-    ]
 
     def load(standing: Standing, inputs: Any) -> tuple[Standing, Any]:
         one, leaves, known = inputs
         one = decided(job, standing, one)
-        after, performance, *solved = play(standing.pile, one.pose, one.action)
-        if one.truck is not None:
-            after = after.replace(
-                height=jnp.where(one.truck >= 0, after.height, standing.pile.height)
-            )
-        assessed, done = assess(job, standing, one, performance, leaves=leaves, cusps=known)
-        known_before = [
-            None if foresees is None else foresees(standing.pile, one.pose, one.action)
-            for foresees in foreseen
-        ]
-        return Standing(after, done), (assessed, solved[0] if solved else None, *known_before)
+        played = _played(job.world, standing.pile, one, report=report)
+        assessed, done = assess(
+            counted, standing, one, played.performance, leaves=leaves, cusps=known
+        )
+        return Standing(played.pile, done), (assessed, played.known)
 
+    counted = counting(job)
     leaves = None if candidate.truck is None else leaves_after(candidate.truck)
-    last, found = load_by_load(load, beginning(job), (candidate, leaves, cusps))
-    return assemble(job, found[0], last, *found[1:])
+    last, (loadings, known) = load_by_load(load, beginning(job), (candidate, leaves, cusps))
+    return assemble(job, loadings, last, known)
+
+
+class Played(NamedTuple):
+    """What a world makes of a loading."""
+
+    pile: Pile  # after it
+    performance: Performance
+    known: Known
+
+
+def _played(world: Any, pile: Pile, one: LoadingPlan, *, report: bool) -> Played:
+    where = pile, one.pose, one.action
+    solve = getattr(world, "solve", None) if report else None
+    after, performance, *solved = (solve or world)(*where)
+    if one.truck is not None:
+        after = after.replace(height=jnp.where(one.truck >= 0, after.height, pile.height))
+    foreseen = {
+        name: getattr(world, name)(*where) for name in FORESIGHT if report and can(world, name)
+    }
+    known = Known(
+        solves=solved[0] if solved else None,
+        stall_probability=foreseen.get("stall_probability"),
+        deviation=foreseen.get("uncertainty"),
+    )
+    return Played(after, performance, known)
+
+
+@jax.jit
+def played_at(world: Any, pile: Pile, one: LoadingPlan) -> Played:
+    """A loading at its pose; one that goes to no truck (-1) is not made."""
+    return _played(world, pile, one, report=True)
+
+
+_decided = jax.jit(decided)
+
+
+def play_one(
+    job: Job, standing: Standing, one: Decisions | LoadingPlan
+) -> tuple[LoadingPlan, Played]:
+    """One loading outside of any trace: where it is dug, and what the world makes of it.
+
+    What is compiled for it serves every objective, site and number of loads.
+
+    Args:
+        job: World and amount; for decisions the toe too.
+        standing: Before the loading.
+        one: As of `decided`.
+    """
+    _ahead.wait()
+    bare = _without(job, "world", "pile", "site", "objective", "yard", "referee")
+    dug = _decided(bare, standing, one)
+    return dug, played_at(job.world, standing.pile, dug)
+
+
+def counting(job: Job) -> Job:
+    """What of a job counts a loading that was played; the same for all worlds, if it can be."""
+    unused = ("pile", "toe", "referee", *(() if job.objective.asks_world else ("world",)))
+    return _without(job, *unused)
+
+
+def _without(job: Job, *names: str) -> Job:
+    """A part of a job, for functions that need no more: what is compiled serves other jobs too."""
+    part: Job = job.replace(**dict.fromkeys(names))
+    return part
+
+
+def play_by_load(job: Job, candidate: Decisions | LoadingPlan) -> PlanResult:
+    """`play_candidate` outside of any trace, one load after the other.
+
+    It compiles the world and what counts a load for themselves: half of what the whole takes, and
+    the same for each number of loads.
+    """
+    leaves = None if candidate.truck is None else leaves_after(jnp.asarray(candidate.truck))
+    tree: Any
+    columns, tree = jax.tree.flatten((candidate, leaves))
+    columns = [np.asarray(column) for column in columns]
+    standing, counted, rows = beginning(job), counting(job), []
+    for n in range(len(columns[0])):
+        one, last = tree.unflatten(column[n] for column in columns)
+        dug, played = play_one(job, standing, one)
+        assessed, done = assess(counted, standing, dug, played.performance, leaves=last)
+        standing = Standing(played.pile, done)
+        rows.append((assessed, played.known))
+    # By numpy: each number of loads would be compiled for.
+    loadings, known = jax.tree.map(lambda *leaves: on_device(np.stack(leaves)), *rows)
+    return assemble(job, loadings, standing, known)
 
 
 def leaves_after(truck: Int[Array, " n"]) -> Bool[Array, " n"]:
@@ -212,7 +301,27 @@ def leaves_after(truck: Int[Array, " n"]) -> Bool[Array, " n"]:
     return (truck >= 0) & (following != truck)
 
 
-outcomes = ParallelMap(play_candidate)
+_ahead = Ahead()
+
+
+def compile_ahead(job: Job, worlds: Sequence[World]) -> None:
+    """Has compiled what plays loads of a job, by decisions along its toe, in worlds; in a thread.
+
+    A first plan needs it last: until then there is other work for one core.
+    """
+    number = np.zeros((1,), job.pile.height.dtype)
+    truck = None if isinstance(job.amount, Loads) else np.zeros((1,), np.int32)
+    one: Any = Decisions(number, number, np.zeros((1, 4), number.dtype), truck)  # type: ignore[arg-type]
+
+    def play() -> None:
+        for world in worlds:
+            play_by_load(job.replace(world=world, referee=None), one)
+
+    if jax.default_backend() == "cpu":
+        _ahead.run(play)
+
+
+outcomes = ParallelMap(play_candidate, on_core=play_by_load)
 """`outcomes(job, candidates)` plays several plans; leaves [K, N]."""
 
 

@@ -20,6 +20,7 @@ from wlplan.site.machine import WA320, WheelLoader
 from wlplan.terrain.heightmap import sample, to_world
 from wlplan.terrain.toe import TOE_RISE, ToeContour, check_accessible
 from wlplan.types import Pile, Pose
+from wlplan.xla import on_device
 
 # Largest heading offset from the inward normal [rad]; the training data have 10 degrees and the
 # contour's own noise adds to that.
@@ -77,10 +78,10 @@ def toe_of(
     rows = np.minimum(np.arange(-(-count // _BLOCK) * _BLOCK), count - 1)
     points, heading = points[rows], heading[rows]
     return Toe(
-        points=jnp.asarray(points, dtype),
-        direction=jnp.asarray(np.stack([np.cos(heading), np.sin(heading)], axis=1), dtype),
-        count=jnp.asarray(count, jnp.int32),
-        closed=jnp.asarray(closed),
+        points=on_device(points.astype(dtype)),
+        direction=on_device(np.stack([np.cos(heading), np.sin(heading)], axis=1).astype(dtype)),
+        count=on_device(np.int32(count)),
+        closed=on_device(np.bool_(closed)),
         width=machine.bucket_width,
     )
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from wlplan.planning import dubins
 from wlplan.planning.driving import Place, Room, rough_depth, ways_by
@@ -197,9 +197,16 @@ def _reverse(place: _Reached, straight: np.ndarray, turn: np.ndarray, radius: fl
 
 def _spread(count: int) -> Float[np.ndarray, "count 3"]:
     """Places spread evenly in a cube from -1 to 1."""
-    # Imported here, as it takes long.
-    from scipy.stats import qmc
+    # Scipy has the sequence of Halton too, and takes a second of the first plan to import.
+    numbers = np.arange(1, count + 1)
+    return 2.0 * np.stack([_mirrored(numbers, base) for base in (2, 3, 5)], axis=-1) - 1.0
 
-    # The first of the sequence is the corner.
-    places: np.ndarray = 2.0 * qmc.Halton(3, scramble=False).random(count + 1)[1:] - 1.0
-    return places
+
+def _mirrored(numbers: Int[np.ndarray, " n"], base: int) -> Float[np.ndarray, " n"]:
+    """Numbers with their digits mirrored at the point (van der Corput)."""
+    found, worth = np.zeros(len(numbers)), 1.0
+    while numbers.any():
+        worth /= base
+        found += worth * (numbers % base)
+        numbers = numbers // base
+    return found

@@ -26,11 +26,12 @@ from wlplan.planning.placement import (
     way_lengths,
     where_allowed,
 )
-from wlplan.planning.playing import assess
+from wlplan.planning.playing import assess, counting
 from wlplan.planning.watch import Watch
 from wlplan.site.receiver import Receiver
 from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.types import LoadingPlan, Pose
+from wlplan.worlds.capabilities import foresee
 from wlplan.xla import ParallelMap
 
 # Digs along the toe, actions at each, and by how many digs, the best, a spot is judged, of so many
@@ -129,7 +130,7 @@ def _yields_of(
 
     def one(raw: Array) -> tuple[Array, Array, Array]:
         dig, action = Pose(*pose), squash(raw)
-        _, performance = job.world(job.pile, dig, action)
+        performance = foresee(job.world, job.pile, dig, action)
         ways = Transport(time, work), Transport(time + more, work)
         near, far = (
             job.objective(Loading(job.pile, dig, action, performance, way, job.site, job.world))
@@ -148,10 +149,12 @@ def _costs_of_some(
     def one(place: Array, pose: Array, action: Array) -> tuple[Array, Array]:
         at = at_receiver(job, Receiver(*place))
         loading = LoadingPlan(Pose(*pose), squash(action))
-        _, performance = job.world(job.pile, loading.pose, loading.action)
+        performance = foresee(job.world, job.pile, loading.pose, loading.action)
         stays = jnp.zeros((), bool)
         standing = beginning(at)
-        assessed, _ = assess(at, standing, loading, performance, leaves=stays, thorough=False)
+        assessed, _ = assess(
+            counting(at), standing, loading, performance, leaves=stays, thorough=False
+        )
         return assessed.cost, performance.mass
 
     return jax.vmap(jax.vmap(one, in_axes=(None, 0, 0)))(*spots)

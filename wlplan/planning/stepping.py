@@ -7,14 +7,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from wlplan.planning.amounts import Outlook
-from wlplan.planning.driving import room_of
-from wlplan.planning.job import Decisions, Job, Standing, decided, judged
-from wlplan.planning.playing import Assessed, assess
-from wlplan.planning.poses import pose_at
+from wlplan.planning.amounts import Amount, Outlook
+from wlplan.planning.job import Decisions, Job, Standing, decided
+from wlplan.planning.playing import Assessed, assess, counting
 from wlplan.planning.search import Cusps
-from wlplan.planning.way import cusps_to
-from wlplan.types import Pile
+from wlplan.types import LoadingPlan, Performance, Pile
+from wlplan.worlds.capabilities import foresee
 
 
 def next_load(
@@ -26,12 +24,11 @@ def next_load(
         job: World, site, objective and toe.
         standing: Before the loading.
         decisions: Of the loading.
-        cusps: Of the best ways to the receiver where they are known, see `cusps_of_next`.
+        cusps: Of the best ways to the receiver where they are known, see `good_ways`.
     """
     one = decided(job, standing, decisions)
-    _, performance = job.world(standing.pile, one.pose, one.action)
-    stays = jnp.zeros((), bool)
-    return assess(job, standing, one, performance, leaves=stays, cusps=cusps, thorough=False)[0]
+    performance = foresee(job.world, standing.pile, one.pose, one.action)
+    return _stays(job, standing, one, performance, cusps)
 
 
 def score_of_next(
@@ -52,6 +49,29 @@ def score_of_next(
     """
     loading = next_load(job, standing, decisions, cusps)
     return score_of(job, standing, loading.cost, loading.performance.mass, outlook)
+
+
+def score_of_played(
+    job: Job,
+    standing: Standing,
+    played: tuple[LoadingPlan, Performance],
+    outlook: Outlook,
+    cusps: Cusps,
+) -> Float[Array, ""]:
+    """The same of a loading that was played."""
+    loading = _stays(job, standing, *played, cusps)
+    return score_of(job, standing, loading.cost, loading.performance.mass, outlook)
+
+
+def _stays(
+    job: Job, standing: Standing, one: LoadingPlan, performance: Performance, cusps: Cusps | None
+) -> Assessed:
+    """What a loading counts that no truck leaves after."""
+    leaves = jnp.zeros((), bool)
+    assessed: Assessed = assess(
+        counting(job), standing, one, performance, leaves=leaves, cusps=cusps, thorough=False
+    )[0]
+    return assessed
 
 
 def score_of(
@@ -77,9 +97,7 @@ def advance(
     outlook: Outlook,
     score: Float[Array, ""] | float,
 ) -> Advanced:
-    """Makes a loading, in the world of the referee if there is one.
-
-    The truck leaves when no further load would make it better.
+    """Makes a loading.
 
     Args:
         job: World, amount and toe.
@@ -89,17 +107,23 @@ def advance(
         score: What `score_of_next` has of it.
     """
     one = decided(job, standing, decisions)
-    after, performance = judged(job).world(standing.pile, one.pose, one.action)
-    amount, mass = job.amount, performance.mass
+    after, performance = job.world(standing.pile, one.pose, one.action)
+    return made(job.amount, standing, (after, performance.mass), outlook, score)
+
+
+def made(
+    amount: Amount,
+    standing: Standing,
+    played: tuple[Pile, Float[Array, ""]],
+    outlook: Outlook,
+    score: Float[Array, ""] | float,
+) -> Advanced:
+    """`advance` for a loading that was played: the pile after it, and its mass [tonne].
+
+    The truck leaves when no further load would make it better.
+    """
+    after, mass = played
     stays = amount.step(standing.done, mass, jnp.zeros((), bool)).done
     step = amount.step(standing.done, mass, amount.should_leave(stays, outlook))
     cost = score - amount.to_go(stays, outlook) + step.cost
     return Advanced(Standing(after, step.done), standing.done.trucks, cost)
-
-
-def cusps_of_next(job: Job, pile: Pile, position: Array, offset: Array) -> Cusps:
-    """Cusps of good ways from where a loading would be, whatever the action."""
-    assert job.toe is not None
-    pose = pose_at(job.toe, pile, position, offset)
-    room, receiver = room_of(job.yard, pile), job.site.placed_receiver
-    return cusps_to(pose, receiver, room, job.site.machine, thorough=False)

@@ -21,6 +21,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, UInt8
 from wlplan.site.machine import WheelLoader
 from wlplan.terrain.standing import CLEARED, pooled, standing
 from wlplan.types import Pile
+from wlplan.xla import on_device
 
 # Cells of the yard come in multiples of so many along each side: what is compiled for one pile
 # serves the next.
@@ -82,8 +83,8 @@ def yard_of(
 
     width = [(border, border + (-n - 2 * border) % _BLOCK) for n in flags(stands).shape]
     return Yard(
-        standing=jnp.asarray(np.pad(flags(stands), width)),
-        unseen=jnp.asarray(np.pad(flags(unseen), width, constant_values=True)),
+        standing=on_device(np.pad(flags(stands), width)),
+        unseen=on_device(np.pad(flags(unseen), width, constant_values=True)),
         origin=jnp.asarray(pile.origin, pile.height.dtype) + (middle - border * cell),
         cell=cell,
         reach=reach,

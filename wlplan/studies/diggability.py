@@ -11,7 +11,7 @@ from flax import struct
 from wlplan.checks import check_action, check_pile, check_world
 from wlplan.terrain.toe import ToeContour, edge_poses, toe_contour
 from wlplan.types import Action, Performance, Pile, Pose, PyTree, World
-from wlplan.worlds.capabilities import as_pytree
+from wlplan.worlds.capabilities import as_pytree, foresee
 
 # The action of the paper's diggability map. Paper, section 7.4.
 PAPER_ACTION = Action(0.68, 4.51, 0.17, 4.46)
@@ -35,8 +35,7 @@ def diggability_map(
 ) -> DiggabilityMap:
     """Predict one action at evenly spaced locations around the toe, all in one batched call.
 
-    Each location digs the pile as it stands, along the inward normal. Only the performance is
-    computed: XLA removes the piles after, which nobody reads.
+    Each location digs the pile as it stands, along the inward normal.
 
     Args:
         world: Simulator or learned model.
@@ -62,5 +61,5 @@ def diggability_map(
 
 @jax.jit
 def _predict(world: PyTree, pile: Pile, pose: Pose, action: Action) -> Performance:
-    predicted: Performance = jax.vmap(lambda one: world(pile, one, action)[1])(pose)
+    predicted: Performance = jax.vmap(lambda one: foresee(world, pile, one, action))(pose)
     return predicted

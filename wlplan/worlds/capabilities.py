@@ -10,6 +10,7 @@ more, where there is more to say:
 * `has_stall_probability`: whether `stall_probability(pile, pose, action)` gives the probability
   that the loading stalls.
 * `faces_seen`: the least and the largest characteristics of the faces that it was trained on.
+* `foresee(pile, pose, action)`: the performance alone, where that takes less than the pile after.
 * `solve(pile, pose, action)`: as by calling it, with a `SolveReport` besides.
 * `with_derivatives()`: the same world in the form that has derivatives.
 * `play_load(pile, pose, action, note)`: plays one loading outside of any trace and returns pile,
@@ -121,6 +122,15 @@ def as_pytree(world: World) -> World:
             *(getattr(world, name) if can(world, name) else None for name in FORESIGHT),
         )
     return world
+
+
+def foresee(world: World, pile: Pile, pose: Pose, action: Action) -> Performance:
+    """The performance of a loading, whatever becomes of the pile."""
+    alone = getattr(world, "foresee", None)
+    performance: Performance = (
+        world(pile, pose, action)[1] if alone is None else alone(pile, pose, action)
+    )
+    return performance
 
 
 def can(world: Any, name: str) -> bool:

@@ -32,7 +32,7 @@ from wlplan.types import (
     SolveReport,
     action_vector,
 )
-from wlplan.worlds.pile_states import Strip, pile_state_of
+from wlplan.worlds.pile_states import Dug, Strip, pile_state_of
 
 
 @no_type_check
@@ -73,6 +73,11 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
         """The same, and how the solvers ended."""
         solved: tuple[Pile, Performance, SolveReport] = _solve(self, pile, pose, action)
         return solved
+
+    def foresee(self, pile: Pile, pose: Pose, action: Action) -> Performance:
+        """The performance alone, the same as by calling it."""
+        performance: Performance = _foresee(self, pile, pose, action)
+        return performance
 
     @property
     def faces_seen(self) -> tuple[Characteristics, Characteristics] | None:
@@ -124,16 +129,29 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
         return probability
 
 
-@jax.jit
-def _solve(
+def _dig(
     world: LearnedWorld, pile: Pile, pose: Pose, action: Action
-) -> tuple[Pile, Performance, SolveReport]:
+) -> tuple[Performance, Dug, tuple[Array, Array]]:
+    """What is loaded, and the part of the pile around it before it slides."""
     predicted = world.performance(sample_local(pile, pose), action_vector(action))
     window, start = window_of(pile, pose)
     per_volume = world.soil.density / KG_PER_TONNE
     dug = pile_state_of(world.pile_state).on_grid(
         pile, window, pose, action, predicted.mass / per_volume, world.machine
     )
+    return predicted.replace(mass=dug.volume * per_volume), dug, start
+
+
+@jax.jit
+def _foresee(world: LearnedWorld, pile: Pile, pose: Pose, action: Action) -> Performance:
+    return _dig(world, pile, pose, action)[0]
+
+
+@jax.jit
+def _solve(
+    world: LearnedWorld, pile: Pile, pose: Pose, action: Action
+) -> tuple[Pile, Performance, SolveReport]:
+    performance, dug, start = _dig(world, pile, pose, action)
     repose = world.soil.repose_angle
     if world.settle:
         settled = settle_dug(pile, dug.height, start, repose_angle=repose, schedule=world.schedule)
@@ -143,7 +161,7 @@ def _solve(
         after = pile.replace(height=paste(pile.height, dug.height, jnp.stack(start)))
         slope = steepest_slope(after, movable(after, repose))
         report = SolveReport(jnp.zeros((), jnp.int32), jnp.array(False), slope, dug.missing)
-    return after, predicted.replace(mass=dug.volume * per_volume), report
+    return after, performance, report
 
 
 @jax.jit

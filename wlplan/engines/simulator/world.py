@@ -43,6 +43,11 @@ class Simulator(struct.PyTreeNode):
         (after, performance, _), _ = _load(self, pile, pose, action)
         return after, performance
 
+    def foresee(self, pile: Pile, pose: Pose, action: Action) -> Performance:
+        """The performance alone, the same as by calling it."""
+        performance: Performance = _foresee(self, pile, pose, action)
+        return performance
+
     @property
     def differentiable(self) -> bool:
         """Whether it passes reverse mode, which takes several times as long."""
@@ -109,19 +114,19 @@ class Simulator(struct.PyTreeNode):
             repose_angle=self.soil.repose_angle,
             schedule=self.schedule,
         )
-        work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
-        performance = Performance(
-            mass=cycle.mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ
-        )
+        performance = _performance(cycle)
         report = SolveReport(settled.rounds, settled.at_rest, settled.steepest_slope, missing)
         return settled.pile, performance, report
 
 
-@jax.jit
-def _load(
+def _performance(cycle: Cycle) -> Performance:
+    work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
+    return Performance(mass=cycle.mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ)
+
+
+def _dig(
     simulator: Simulator, pile: Pile, pose: Pose, action: Action
-) -> tuple[tuple[Pile, Performance, SolveReport], Cycle]:
-    """One loading, and the record of its cycle."""
+) -> tuple[Float[Array, "52 52"], Cycle]:
     height, ground = simulator.view(pile, pose)
     cycle = dig(
         height,
@@ -131,4 +136,18 @@ def _load(
         soil=simulator.soil,
         settings=simulator.settings,
     )
+    return height, cycle
+
+
+@jax.jit
+def _foresee(simulator: Simulator, pile: Pile, pose: Pose, action: Action) -> Performance:
+    return _performance(_dig(simulator, pile, pose, action)[1])
+
+
+@jax.jit
+def _load(
+    simulator: Simulator, pile: Pile, pose: Pose, action: Action
+) -> tuple[tuple[Pile, Performance, SolveReport], Cycle]:
+    """One loading, and the record of its cycle."""
+    height, cycle = _dig(simulator, pile, pose, action)
     return simulator.leave(pile, pose, height, cycle), cycle

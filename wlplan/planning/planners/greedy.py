@@ -14,11 +14,22 @@ from jaxtyping import Array, Float
 from wlplan.planning.amounts import Loads, Outlook
 from wlplan.planning.job import Decisions, Job, Standing, beginning, judged, padded, stacked
 from wlplan.planning.load_search import LoadSearch, Memory, Tried
+from wlplan.planning.playing import counting, play_one
 from wlplan.planning.proposals import NothingWorthIt, Progress, Proposals
 from wlplan.planning.search import Cusps
-from wlplan.planning.stepping import advance, score_of_next
+from wlplan.planning.stepping import made, score_of_played
 from wlplan.planning.watch import Watch, watching
+from wlplan.types import Pile
 from wlplan.xla import ParallelMap
+
+
+class Chosen(NamedTuple):
+    """The load that a planner makes next."""
+
+    decision: Decisions
+    score: float  # as of `score_of_next`, to which later loads may not add
+    # The pile after it and its mass [tonne], by the referee if there is one; None: not played.
+    played: tuple[Pile, Float[Array, ""]] | None = None
 
 
 class Grown(NamedTuple):
@@ -91,9 +102,12 @@ class Greedy(LoadSearch):
             outlook = memory.outlook
             assert outlook is not None
             left = loads - len(made)
-            decision, score = self.choose(job, standing, tried, outlook, left, watch)
-            watch.spend(loading=1)
-            after, truck, cost = _advance(job, standing, decision, outlook, score)
+            decision, score, played = self.choose(job, standing, tried, outlook, left, watch)
+            if played is None:
+                watch.spend(loading=1)
+                _, one = play_one(judged(job), standing, decision)
+                played = one.pile, one.performance.mass
+            after, truck, cost = _made(job.amount, standing, played, outlook, score)
             if not job.amount.is_worth(float(after.done.mass - standing.done.mass)):
                 break
             standing = after
@@ -113,8 +127,8 @@ class Greedy(LoadSearch):
         outlook: Outlook,
         left: int,
         watch: Watch,
-    ) -> tuple[Decisions, float]:
-        """The next load, and its score as of `score_of_next`, to which later loads may not add.
+    ) -> Chosen:
+        """The next load.
 
         Args:
             job: With its toe.
@@ -126,15 +140,17 @@ class Greedy(LoadSearch):
         """
         del left
         found = self.best(job.replace(referee=None), standing, tried, outlook, watch)
-        scores = found.scores
+        scores, played = found.scores, None
         if job.referee is not None:
             watch.spend(loading=len(scores))
             loads = found.decisions, found.cusps
-            scores = np.asarray(_scores_as_played((judged(job), standing, outlook), loads))
-            scores = np.nan_to_num(scores, nan=np.inf)
+            scores, *played = _scores_as_played((judged(job), standing, outlook), loads)
+            scores = np.nan_to_num(np.asarray(scores), nan=np.inf)
         best = int(np.argmin(scores))
-        decision: Decisions = jax.tree.map(lambda leaf: leaf[best], found.decisions)
-        return decision, float(scores[best])
+        decision, after = jax.tree.map(
+            lambda leaf: np.asarray(leaf)[best], (found.decisions, played)
+        )
+        return Chosen(decision, float(scores[best]), None if after is None else tuple(after))
 
 
 def plan_of(job: Job, made: Sequence[Grown], loads: int) -> Decisions:
@@ -153,12 +169,16 @@ def cost_of(job: Job, made: Sequence[Grown]) -> float:
 
 def _score_as_played(
     shared: tuple[Job, Standing, Outlook], load: tuple[Decisions, Cusps]
-) -> Float[Array, ""]:
-    """Score of a load by what the world of the job makes of it."""
+) -> tuple[Float[Array, ""], Pile, Float[Array, ""]]:
+    """Score of a load by what the world of the job makes of it, the pile after it, its mass."""
     job, standing, outlook = shared
     decision, cusps = load
-    return score_of_next(job, standing, decision, outlook, cusps)
+    one, played = play_one(job, standing, decision)
+    made = one, played.performance
+    score = _score_of_played(counting(job), standing, made, outlook, cusps)
+    return score, played.pile, played.performance.mass
 
 
-_scores_as_played = ParallelMap(_score_as_played)
-_advance = jax.jit(advance)
+_score_of_played = jax.jit(score_of_played)
+_scores_as_played = ParallelMap(_score_as_played, on_core=_score_as_played)
+_made = jax.jit(made)

@@ -16,7 +16,7 @@ from wlplan.planning.amounts import Done, Outlook, Trucks
 from wlplan.planning.descent import descend
 from wlplan.planning.job import Decisions, Job, Standing, can_refine, contour_length
 from wlplan.planning.load_search import Tried
-from wlplan.planning.planners.greedy import Greedy
+from wlplan.planning.planners.greedy import Chosen, Greedy
 from wlplan.planning.stepping import advance, score_of, score_of_next
 from wlplan.planning.watch import Watch
 from wlplan.xla import ParallelMap
@@ -29,7 +29,7 @@ class _Node(NamedTuple):
     cost: float  # of the loads, without waits for trucks, of which every plan has as many
     later: float  # cost of the trucks after the one that is there
     digs: tuple[int, ...] = ()  # rows of the raster of poses
-    first: tuple[Decisions, float] | None = None  # of the loads, and its score
+    first: Chosen | None = None  # of the loads
 
 
 class _Child(NamedTuple):
@@ -42,9 +42,9 @@ class _Child(NamedTuple):
     value: float  # cost of all loads so far and of all that is left to do
 
     @property
-    def first(self) -> tuple[Decisions, float]:
-        """The first load of the row, and its score."""
-        return self.parent.first or (self.decision, self.score)
+    def first(self) -> Chosen:
+        """The first load of the row."""
+        return self.parent.first or Chosen(self.decision, self.score)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +94,7 @@ class TreeSearch(Greedy):
         outlook: Outlook,
         left: int,
         watch: Watch,
-    ) -> tuple[Decisions, float]:
+    ) -> Chosen:
         """The first load of the cheapest row of loads."""
         job, ended = job.replace(referee=None), list[_Child]()
         nodes = [_Node(standing, 0.0, float(_cost_of_later(job, standing.done, outlook)))]
