@@ -41,7 +41,7 @@ def comment_of(node: ast.AnnAssign, lines: list[str]) -> str:
     """The comment on the last line of a field, or else the block of comments above it."""
     if found := re.search(r"\s#\s(?!type:)(.*)", lines[(node.end_lineno or node.lineno) - 1]):
         return re.sub(r"^type: ignore\S*\s+#\s*", "", found[1])
-    above = []
+    above: list[str] = []
     for line in reversed(lines[: node.lineno - 1]):
         if not line.strip().startswith("# "):
             break
