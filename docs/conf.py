@@ -21,7 +21,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx_click",
+    "commands",
     "contents",
     "docstrings",
 ]
@@ -44,6 +44,7 @@ maximum_signature_line_length = 80
 napoleon_use_ivar = True
 
 smartquotes = False
+html_show_copyright = False
 html_theme = "furo"
 html_title = "wlplan"
 html_static_path = ["_site/static"]
