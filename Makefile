@@ -85,9 +85,10 @@ lint: $(VENV)/.tools
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 
-# -W: a warning is an error, so a link that leads nowhere fails.
+# -W: a warning is an error, so a link that leads nowhere fails. -aE: all pages anew, since each shows
+# the titles of all.
 docs: $(VENV)/.tools
-	$(BIN)/python -m sphinx -b html -W --keep-going -q -c docs . out/docs/html
+	$(BIN)/python -m sphinx -b html -aE -W --keep-going -q -c docs . out/docs/html
 	@echo "open out/docs/html/index.html"
 
 weights: $(VENV)/.package

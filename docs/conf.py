@@ -15,7 +15,7 @@ project = "wlplan"
 author = "the authors of wlplan"
 root_doc = "docs/index"
 include_patterns = ["docs/**.md", "experiments/README.md", "CONTRIBUTING.md", "CHANGELOG.md"]
-exclude_patterns = ["**/.*", "out", "demo", "build", "dist", "wlplan", "tests"]
+exclude_patterns = [".*", "**/.*", "out", "demo", "build", "dist", "wlplan", "tests"]
 
 extensions = [
     "myst_parser",

@@ -88,9 +88,10 @@ def short(value: Any) -> str:
 
 
 def tidy(signature: str) -> str:
-    """Names for what they stand for, and no space in shapes of one axis, which a linter wants."""
+    """Names for what they stand for, short arrays, and no space in shapes of one axis."""
     for long, name in ALIASES.items():
         signature = signature.replace(long, name)
+    signature = re.sub(r"\b(jaxlib\._jax|numpy|np)\.(?=Array|ndarray)", "", signature)
     return re.sub(r"(['\"]) (\w+['\"])", r"\1\2", signature)
 
 
@@ -107,6 +108,23 @@ def show_fields(app: Any, what: str, name: str, obj: Any, options: Any, lines: l
         typed = f"`{kind}`" if kind.isidentifier() and not default else f"``{kind}{default}``"
         meaning = re.sub(r"([|*])", r"\\\1", meaning)
         lines.append(f"    {field}: {typed}" + (f"; {meaning}" if meaning else ""))
+
+
+def keep_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Joins again what napoleon took apart at a colon, for a type: ours stand in signatures."""
+    for index, line in reversed(list(enumerate(lines))):
+        if found := re.match(r":r?type: (.*)", line):
+            del lines[index]
+            first = next((n for n, text in enumerate(lines) if text.startswith(":returns: ")), 0)
+            mark = ":returns: " if lines[first].startswith(":returns: ") else ""
+            lines[first] = f"{mark}{found[1]}: {lines[first].removeprefix(mark)}"
+
+
+def use_colons(app: Any, tree: nodes.document) -> None:
+    """A colon between a name and what it means."""
+    for text in list(tree.findall(nodes.Text)):
+        if text == " -- ":
+            text.parent.replace(text, nodes.Text(": "))
 
 
 def show_signature(
@@ -147,6 +165,8 @@ def setup(app: Any) -> dict[str, bool]:
     app.setup_extension("sphinx.ext.autodoc")
     # Before napoleon, which reads what is added.
     app.connect("autodoc-process-docstring", show_fields, priority=400)
+    app.connect("autodoc-process-docstring", keep_colons, priority=600)
+    app.connect("doctree-read", use_colons)
     app.connect("autodoc-process-signature", show_signature)
     app.connect("autodoc-skip-member", leave_out)
     app.add_role_to_domain("py", "name", Name())
