@@ -120,11 +120,13 @@ def keep_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: l
             lines[first] = f"{mark}{found[1]}: {lines[first].removeprefix(mark)}"
 
 
-def use_colons(app: Any, tree: nodes.document) -> None:
-    """A colon between a name and what it means."""
+def plainer(app: Any, tree: nodes.document) -> None:
+    """A colon between a name and what it means, and an array by the name that users know."""
     for text in list(tree.findall(nodes.Text)):
         if text == " -- ":
             text.parent.replace(text, nodes.Text(": "))
+        elif text.startswith("jaxlib._jax."):
+            text.parent.replace(text, nodes.Text(text.rpartition(".")[2]))
 
 
 def show_signature(
@@ -166,7 +168,7 @@ def setup(app: Any) -> dict[str, bool]:
     # Before napoleon, which reads what is added.
     app.connect("autodoc-process-docstring", show_fields, priority=400)
     app.connect("autodoc-process-docstring", keep_colons, priority=600)
-    app.connect("doctree-read", use_colons)
+    app.connect("doctree-read", plainer)
     app.connect("autodoc-process-signature", show_signature)
     app.connect("autodoc-skip-member", leave_out)
     app.add_role_to_domain("py", "name", Name())
