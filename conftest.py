@@ -1,9 +1,11 @@
 """The code blocks of README and docs/ are tests: `make test-slow` runs them.
 
 Python blocks run, one after the other in one namespace a page, in a folder that holds a scan and
-models for them. Shell blocks are not run, for some would take hours: every `wlplan` command has to
-parse, every target of make, every extra of pip and every module of Python has to exist. TOML blocks
-are read as what their first line calls them, and written for the blocks after.
+models for them. Blocks called `bash` run too, in that folder, and a block called `output` after one
+holds lines that it printed, numbers aside. Blocks called `sh` are not run, for some would take
+hours: every `wlplan` command has to parse, every target of make, every extra of pip and every
+module of Python has to exist. TOML blocks are read as what their first line calls them, and written
+for the blocks after.
 """
 
 from __future__ import annotations
@@ -13,6 +15,8 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 import tempfile
 import tomllib
 from pathlib import Path
@@ -60,6 +64,48 @@ def check_command(words: list[str]) -> None:
         raise AssertionError(f"{program}: do not know how to check it; skip the block")
 
 
+def run_shell(example: Example) -> None:
+    """Runs a shell block, with this package as `wlplan`, and remembers what it printed."""
+    text = str(example.parsed)
+    if re.search(r"^chromium ", text, re.MULTILINE) and shutil.which("chromium") is None:
+        pytest.skip("there is no chromium to print with")
+    tools = Path("tools").resolve()
+    tools.mkdir(exist_ok=True)
+    # The sandbox of a browser does not go with a container's root.
+    for name, command in {
+        "wlplan": f"{shlex.quote(sys.executable)} -m wlplan",
+        "chromium": f"{shutil.which('chromium')} --no-sandbox",
+    }.items():
+        (tools / name).write_text(f'#!/bin/sh\nexec {command} "$@"\n')
+        (tools / name).chmod(0o755)
+    paths = {"PATH": f"{tools}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", text],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env=os.environ | paths,
+        text=True,
+        timeout=1800,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+    example.namespace["_printed"] = done.stdout
+
+
+def without_numbers(line: str) -> str:
+    """A line as it is on every machine: last digits differ, and with them plans and widths."""
+    return " ".join(re.sub(r"[-+]?\d+([.,]\d+)*", "#", line).split())
+
+
+def check_output(example: Example) -> None:
+    """Refuses a line that the last shell block did not print."""
+    printed = {without_numbers(line) for line in example.namespace["_printed"].splitlines()}
+    wanted = [without_numbers(line) for line in str(example.parsed).splitlines()]
+    missing = [line for line in wanted if line not in printed]
+    assert wanted, "an empty block shows nothing"
+    assert not missing, f"not printed: {missing}, but {sorted(printed)}"
+
+
 def check_toml(example: Example) -> None:
     """Reads a TOML block as the machine or the soil that its first line names, and writes it."""
     from wlplan.site.presets import machine_named, soil_named
@@ -103,10 +149,12 @@ pytest_collect_file = Sybil(
     parsers=[
         PythonCodeBlockParser(),
         CodeBlockParser("sh", check_shell),
+        CodeBlockParser("bash", run_shell),
+        CodeBlockParser("output", check_output),
         CodeBlockParser("toml", check_toml),
         SkipParser(),
     ],
-    filenames=["README.md", "CONTRIBUTING.md", *(path.name for path in ROOT.glob("docs/*.md"))],
+    filenames=["README.md", "CONTRIBUTING.md", *(path.name for path in ROOT.glob("docs/**/*.md"))],
     setup=enter_folder,
     teardown=leave_folder,
 ).pytest()

@@ -46,6 +46,9 @@ def test_two_loads_are_planned_written_and_played_again(tmp_path: Path) -> None:
         for quantity in ("mass", "time"):
             if load["predicted"][quantity] != pytest.approx(load["simulated"][quantity], rel=0.25):
                 assert f"load {number}" in told or f", {number}" in told
+    page = (Path(__file__).parents[1] / "docs/plan-json.md").read_text()
+    for fields in (plan, plan["total"], plan["ledger"], plan["loads"][0]):
+        assert not [name for name in fields if f"`{name}`" not in page]
     ledger = plan["ledger"]
     lost = ledger["density"] * (ledger["volume_before"] - ledger["volume_after"])
     assert ledger["mass_removed"] == pytest.approx(lost, rel=1e-4)

@@ -19,8 +19,8 @@ class NothingWorthIt(Exception):  # noqa: N818
 class Proposals(NamedTuple):
     """The plans that a planner hands over, for the world or a referee to pick from.
 
-    Plans are `Decisions`, which follow the toe of whatever pile they are played on, or
-    `LoadingPlan`s, whose poses are fixed.
+    A plan is of `Decisions`, which follow the toe of whatever pile they are played on, or a
+    `LoadingPlan`, whose poses are fixed.
     """
 
     candidates: Decisions | LoadingPlan  # leaves [K, N], or [N] of a single plan
