@@ -160,9 +160,7 @@ def export(
     return compared
 
 
-def compare(
-    function: PortableFunction, file: str, found: Numbers, expected: Numbers
-) -> Compared:
+def compare(function: PortableFunction, file: str, found: Numbers, expected: Numbers) -> Compared:
     """How far outputs are off.
 
     Args:
@@ -183,7 +181,9 @@ def compare(
             )
         off = np.abs(got.astype(np.float64) - want.astype(np.float64))
         # What is no number on one side only is off without bound.
-        both = np.isnan(got) & np.isnan(want) if want.dtype.kind == "f" else np.zeros_like(off, bool)
+        both = (
+            np.isnan(got) & np.isnan(want) if want.dtype.kind == "f" else np.zeros_like(off, bool)
+        )
         off = np.where(both, 0.0, np.where(np.isnan(off), np.inf, off))
         size = float(np.abs(np.where(np.isfinite(want), want, 0)).max(initial=0.0))
         largest[port.name] = float(off.max(initial=0.0))
@@ -222,7 +222,9 @@ def _outputs(function: PortableFunction) -> Numbers:
 
 def _check_file(function: PortableFunction, expected: Numbers) -> bytes:
     arrays = {
-        **{f"input_{port.name}": v for port, v in zip(function.inputs, function.cases, strict=True)},
+        **{
+            f"input_{port.name}": v for port, v in zip(function.inputs, function.cases, strict=True)
+        },
         **{f"output_{port.name}": v for port, v in zip(function.outputs, expected, strict=True)},
     }
     file = io.BytesIO()
@@ -230,9 +232,7 @@ def _check_file(function: PortableFunction, expected: Numbers) -> bytes:
     return file.getvalue()
 
 
-def _description(
-    function: PortableFunction, facts: Mapping[str, Any], tolerance: float
-) -> bytes:
+def _description(function: PortableFunction, facts: Mapping[str, Any], tolerance: float) -> bytes:
     record = {
         "format": FORMAT,
         "name": function.name,

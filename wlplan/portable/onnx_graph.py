@@ -93,13 +93,11 @@ class Graph:
         return self._body(closed.jaxpr, [*constants, *inputs])
 
     def _body(self, jaxpr: core.Jaxpr, inputs: Sequence[str]) -> list[str]:
-        names: dict[Any, str] = dict(
-            zip([*jaxpr.constvars, *jaxpr.invars], inputs, strict=True)
-        )
+        names: dict[Any, str] = dict(zip([*jaxpr.constvars, *jaxpr.invars], inputs, strict=True))
 
         def name_of(atom: Any) -> str:
             if isinstance(atom, core.Literal):
-                return self.constant(np.asarray(atom.val, atom.aval.dtype))
+                return self.constant(np.asarray(atom.val, _aval(atom).dtype))
             return names[atom]
 
         for equation in jaxpr.eqns:
@@ -115,8 +113,8 @@ class Graph:
         if name in _IDENTITY:
             return inputs
         if name in _CALLS:
-            body = parameters.get("jaxpr", parameters.get("call_jaxpr"))
-            return self.add(body, inputs)
+            body = "jaxpr" if "jaxpr" in parameters else "call_jaxpr"
+            return self.add(parameters[body], inputs)
         if name == "while":
             return self._loop(parameters, inputs)
         if name in _REDUCTIONS:
@@ -160,12 +158,14 @@ class Graph:
 
     def like(self, value: Any, atom: Any) -> str:
         """A number of the type of a variable."""
-        return self.constant(np.asarray(value, atom.aval.dtype))
+        return self.constant(np.asarray(value, _aval(atom).dtype))
 
     def _shape(self, shape: Sequence[Any]) -> str:
         if all(isinstance(size, int) for size in shape):
             return self.whole(shape)
-        parts = [self.whole([size]) if isinstance(size, int) else self._size(size) for size in shape]
+        parts = [
+            self.whole([size]) if isinstance(size, int) else self._size(size) for size in shape
+        ]
         return self.node("Concat", *parts, axis=0)
 
     def _size(self, size: Any) -> str:
@@ -186,7 +186,7 @@ class Graph:
     def _check_logic(self, equation: core.JaxprEqn) -> None:
         """`and`, `or` and `not` are known of truth values alone."""
         name = equation.primitive.name
-        if name in ("and", "or", "not") and equation.invars[0].aval.dtype != np.bool_:
+        if name in ("and", "or", "not") and _aval(equation.invars[0]).dtype != np.bool_:
             raise InputError(
                 f"ONNX export does not know what JAX calls {name} of whole numbers: export as "
                 f"stablehlo instead."
@@ -197,7 +197,7 @@ class Graph:
         if not equation.params["axes"]:
             return value
         axes = self.whole(equation.params["axes"])
-        if equation.invars[0].aval.dtype != np.bool_:
+        if _aval(equation.invars[0]).dtype != np.bool_:
             return self.node(kind, value, axes, keepdims=0)
         number = self.node("Cast", value, to=TensorProto.INT32)
         return self.node("Cast", self.node(kind, number, axes, keepdims=0), to=TensorProto.BOOL)
@@ -277,20 +277,25 @@ class Graph:
 Rule = Callable[[Graph, core.JaxprEqn, list[str]], str]
 
 
+def _aval(atom: Any) -> Any:
+    """Shape and type of what goes in or comes out."""
+    return atom.aval
+
+
 def _type(dtype: Any) -> int:
     return int(helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
 
 def _broadcast_in_dim(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
     shape, places = equation.params["shape"], equation.params["broadcast_dimensions"]
-    sizes = dict(zip(places, equation.invars[0].aval.shape, strict=True))
+    sizes = dict(zip(places, _aval(equation.invars[0]).shape, strict=True))
     ones = [sizes.get(axis, 1) for axis in range(len(shape))]
     value = graph.shaped(inputs[0], ones)
     return value if tuple(ones) == tuple(shape) else graph.expanded(value, shape)
 
 
 def _reshaped(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
-    return graph.shaped(inputs[0], equation.outvars[0].aval.shape)
+    return graph.shaped(inputs[0], _aval(equation.outvars[0]).shape)
 
 
 def _transpose(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
@@ -303,7 +308,7 @@ def _concatenate(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> st
 
 def _stack(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
     axis = equation.params["axis"]
-    shape = list(equation.outvars[0].aval.shape)
+    shape = list(_aval(equation.outvars[0]).shape)
     shape[axis] = 1
     return graph.node("Concat", *(graph.shaped(value, shape) for value in inputs), axis=axis)
 
@@ -330,8 +335,8 @@ def _pad(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
 def _dot_general(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
     (left_sum, right_sum), (left_batch, right_batch) = equation.params["dimension_numbers"]
     letters = iter(string.ascii_letters)
-    left = [next(letters) for _ in equation.invars[0].aval.shape]
-    right = [next(letters) for _ in equation.invars[1].aval.shape]
+    left = [next(letters) for _ in _aval(equation.invars[0]).shape]
+    right = [next(letters) for _ in _aval(equation.invars[1]).shape]
     for ours, theirs in ((left_sum, right_sum), (left_batch, right_batch)):
         for k, other in zip(ours, theirs, strict=True):
             right[other] = left[k]
@@ -344,11 +349,11 @@ def _dot_general(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> st
 
 def _select_n(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
     which, *choices = inputs
-    if len(choices) != 2 or equation.invars[0].aval.dtype != np.bool_:
+    if len(choices) != 2 or _aval(equation.invars[0]).dtype != np.bool_:
         raise InputError(
             "ONNX export does not know a choice of more than two: export as stablehlo instead."
         )
-    return graph.choice(which, choices[1], choices[0], equation.outvars[0].aval.dtype)
+    return graph.choice(which, choices[1], choices[0], _aval(equation.outvars[0]).dtype)
 
 
 def _clamp(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
@@ -381,7 +386,7 @@ def _expm1(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
 
 
 def _unequal(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
-    if equation.invars[0].aval.dtype == np.bool_:
+    if _aval(equation.invars[0]).dtype == np.bool_:
         return graph.node("Xor", *inputs)
     return graph.node("Not", graph.node("Equal", *inputs))
 
@@ -401,13 +406,13 @@ def _atan2(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
 
 
 def _iota(graph: Graph, equation: core.JaxprEqn, inputs: list[str]) -> str:
-    shape, axis = equation.outvars[0].aval.shape, equation.params["dimension"]
+    shape, axis = _aval(equation.outvars[0]).shape, equation.params["dimension"]
     ones = [size if k == axis else 1 for k, size in enumerate(shape)]
     if not isinstance(shape[axis], int):
         raise InputError(
             "ONNX export does not know the number of a case: export as stablehlo instead."
         )
-    values = np.arange(shape[axis], dtype=equation.outvars[0].aval.dtype).reshape(ones)
+    values = np.arange(shape[axis], dtype=_aval(equation.outvars[0]).dtype).reshape(ones)
     return graph.expanded(graph.constant(values), shape)
 
 

@@ -28,9 +28,7 @@ def content(function: PortableFunction) -> bytes:
 
 def outputs(content: bytes, function: PortableFunction) -> tuple[np.ndarray, ...]:
     """What the file computes, case by case."""
-    wrapped = dataclasses.replace(
-        stablehlo.exported(function, 1), mlir_module_serialized=content
-    )
+    wrapped = dataclasses.replace(stablehlo.exported(function, 1), mlir_module_serialized=content)
     call = jax.jit(wrapped.call)
     rows = [
         [np.asarray(output) for output in call(*(case[n : n + 1] for case in function.cases))]

@@ -1,4 +1,4 @@
-"""ONNX, for the runtimes of networks: any batch. Learned predictors go in it, whole worlds do not."""
+"""ONNX, for the runtimes of networks: any batch. Predictors go in it, whole worlds do not."""
 
 from __future__ import annotations
 

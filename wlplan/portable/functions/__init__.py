@@ -24,6 +24,7 @@ from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour, edge_poses
 from wlplan.types import Pile, Pose, World
 
+
 @dataclasses.dataclass(frozen=True)
 class Asked:
     """What a function is to be made of.
@@ -98,11 +99,13 @@ def local_map(name: str, cells: int, displacement: float) -> Port:
 def poses(asked: Asked) -> Pose:
     """Poses all around the toe, leaves (n,): the cases."""
     found = edge_poses(asked.contour, asked.count)
-    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), found)
+    as_given: Pose = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), found)
+    return as_given
 
 
 def actions(asked: Asked) -> Float[np.ndarray, "n 4"]:
     """Actions that fill their box evenly: the cases."""
     low, high = np.asarray(ACTION_LOW), np.asarray(ACTION_HIGH)
     parts = latin_hypercube(asked.count, 4, np.random.default_rng(asked.seed))
-    return (low + parts * (high - low)).astype(np.float32)
+    values: np.ndarray = (low + parts * (high - low)).astype(np.float32)
+    return values

@@ -19,7 +19,7 @@ def portable(asked: Asked) -> PortableFunction:
         f"y = origin[1] + j * {pile.cell_size:g} m"
     )
     inputs = (
-        Port("height", f"surface of the pile and the terrain around it: {cell}", "m", "world", grid),
+        Port("height", f"surface of pile and terrain: {cell}", "m", "world", grid),
         Port("ground", "what cannot be moved: floor under the pile", "m", "world", grid),
         Port("origin", "x and y of the centre of cell [0, 0]", "m", "world", (2,)),
         Port(
