@@ -25,7 +25,7 @@ DENSITY = 1.7  # of what that world digs [tonne/m^3]
 
 
 def env_of(**settings: Any) -> LoadingEnv:
-    given = {"piles": PILES, "amount": AMOUNT, "limit": 4, "site": SITE} | settings
+    given: dict[str, Any] = {"piles": PILES, "amount": AMOUNT, "limit": 4, "site": SITE, **settings}
     return LoadingEnv(bowl_world, **given)
 
 
