@@ -19,14 +19,7 @@ LIBRARIES: tuple[str, ...] = ()
 def content(function: PortableFunction) -> bytes:
     """The serialized `jax.export.Exported`."""
     (batch,) = export.symbolic_shape("batch")
-    try:
-        return bytes(exported(function, batch).serialize())
-    except (ValueError, NotImplementedError) as error:
-        # JAX refuses what calls back into Python, and what compilers promise nothing about.
-        raise InputError(
-            f"{function.name} cannot be exported as StableHLO ({one_line(error)}): leave out what "
-            f"calls back into Python."
-        ) from error
+    return bytes(exported(function, batch).serialize())
 
 
 def exported(function: PortableFunction, batch: Any) -> export.Exported:
@@ -35,6 +28,9 @@ def exported(function: PortableFunction, batch: Any) -> export.Exported:
     Args:
         function: For one case.
         batch: Number of cases, or a symbol for it.
+
+    Raises:
+        InputError: If it does what JAX does not export.
     """
     shapes = [
         jax.ShapeDtypeStruct((batch, *port.shape), jnp.dtype(port.dtype))
@@ -42,7 +38,14 @@ def exported(function: PortableFunction, batch: Any) -> export.Exported:
     ]
     # An input that the function does not look at is still one: all models of a kind look alike.
     mapped = jax.jit(jax.vmap(function.function), keep_unused=True)
-    return export.export(mapped)(*shapes)
+    try:
+        return export.export(mapped)(*shapes)
+    except (ValueError, NotImplementedError) as error:
+        # JAX refuses what calls back into Python, and what compilers promise nothing about.
+        raise InputError(
+            f"{function.name} cannot be exported as StableHLO ({one_line(error)}): leave out what "
+            f"calls back into Python."
+        ) from error
 
 
 def outputs(content: bytes, function: PortableFunction) -> tuple[np.ndarray, ...]:
