@@ -57,7 +57,7 @@ class Episodes(struct.PyTreeNode):
     world: World
     courses: Course  # leaves [K, ...], all on grids of one size
     objective: Objective = struct.field(pytree_node=False)
-    limit: int = struct.field(pytree_node=False)  # loads after which an episode is cut off
+    limit: Int[Array, ""]  # loads after which an episode is cut off
 
     @property
     def count(self) -> int:
@@ -168,7 +168,7 @@ def make_episodes(
         for job in jobs
     ]
     together = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *courses)
-    return Episodes(as_pytree(world), together, jobs[0].objective, most)
+    return Episodes(as_pytree(world), together, jobs[0].objective, jnp.asarray(most, jnp.int32))
 
 
 def begin(episodes: Episodes, number: Int[Array, ""] | int) -> tuple[State, Observation]:
