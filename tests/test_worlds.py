@@ -176,6 +176,32 @@ def test_a_played_plan_says_how_its_solves_ended(scene: Scene) -> None:
     assert np.degrees(ended.steepest_slope[0]) > 33.5
 
 
-def test_a_world_can_be_jitted_as_it_is(scene: Scene) -> None:
-    world = load_world("low")
-    np.testing.assert_allclose(jax.jit(world)(*scene)[0].height, world(*scene)[0].height, atol=1e-6)
+@pytest.mark.parametrize(
+    "name",
+    ["low", *(pytest.param(name, marks=pytest.mark.slow) for name in FOR_PLANNING[1:])],
+)
+def test_worlds_pass_transformations_as_they_are(scene: Scene, name: str) -> None:
+    world = with_derivatives(load_world(name))
+    after, performance = world(*scene)
+    np.testing.assert_allclose(jax.jit(world)(*scene)[0].height, after.height, atol=1e-6)
+    twice = jax.vmap(world)(*jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), scene))
+    np.testing.assert_allclose(twice[1].mass, [performance.mass] * 2, rtol=1e-4)
+
+    pile, pose, action = scene
+    slope = jax.jit(jax.grad(lambda pose: world(pile, pose, action)[1].mass))(pose)
+    assert np.isfinite(jax.tree.leaves(slope)).all()
+    assert np.any(np.asarray(jax.tree.leaves(slope)) != 0.0)
+
+
+@pytest.mark.parametrize("kind", ["psi_low", "psi_high", "phi", "stall"])
+def test_models_are_functions_to_jax(kind: str) -> None:
+    # JAX keeps what it compiled by the function, so that one needs a hash.
+    model: Any = load_model(pretrained_path(kind), kind)
+    single = getattr(model, "members", model)
+    for function in (model, single, LocalChange(model)):
+        assert {function: 1}[function] == 1
+    cells = 52 if kind == "phi" else 36
+    local = LocalHeightmap(jnp.zeros((cells, cells)), 0.1, 0.0)
+    more = (jnp.float32(1.0), jnp.zeros((cells, cells))) if kind == "phi" else ()
+    action = jnp.array([0.4, 2.0, 0.3, 3.0])
+    jax.eval_shape(jax.jit(model), local, action, *more)

@@ -17,7 +17,17 @@ from collections.abc import Sequence
 
 import click
 
-from wlplan.cli import benchmark, gradients, info, kept, learning, maps, planning, programs
+from wlplan.cli import (
+    benchmark,
+    exporting,
+    gradients,
+    info,
+    kept,
+    learning,
+    maps,
+    planning,
+    programs,
+)
 from wlplan.errors import InputError
 
 # Commands in which nothing is compiled.
@@ -57,7 +67,8 @@ def wlplan(context: click.Context) -> None:
 # In the order in which people use them, which is that of the help.
 for _command in (
     *(info.info, planning.plan, planning.simulate, maps.diggability, learning.collect),
-    *(learning.train, learning.evaluate, gradients.gradcheck, benchmark.bench, kept.cache),
+    *(learning.train, learning.evaluate, exporting.export, gradients.gradcheck),
+    *(benchmark.bench, kept.cache),
 ):
     wlplan.add_command(_command)
 

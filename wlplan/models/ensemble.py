@@ -25,7 +25,7 @@ PERCENT_90 = 1.6449
 
 
 @no_type_check
-class Ensemble(struct.PyTreeNode):
+class Ensemble(struct.PyTreeNode, eq=False):
     """Trained ψ_low or ψ_high that differ in the seed alone. A pytree: all weights are leaves.
 
     What they look at is worked out once for all members, see `PerformanceModel.view`.

@@ -31,7 +31,7 @@ _LEAST, _BEND = 0.001, 0.01
 
 
 @no_type_check
-class PerformanceModel(struct.PyTreeNode, abc.ABC):
+class PerformanceModel(struct.PyTreeNode, abc.ABC, eq=False):
     """A trained performance predictor ψ. A pytree: weights and normalisers are leaves.
 
     It looks at a local heightmap by its `view`: an array, which data sets store. Whoever has the

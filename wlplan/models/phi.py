@@ -129,7 +129,7 @@ class HeightChange(nnx.Module):
 
 
 @no_type_check
-class HeightChangeModel(struct.PyTreeNode):
+class HeightChangeModel(struct.PyTreeNode, eq=False):
     """A trained `HeightChange`. A pytree: weights and components are leaves."""
 
     conserves_volume: ClassVar[bool] = True

@@ -145,7 +145,7 @@ def _blend_weight(cells: int) -> np.ndarray:
 
 
 @no_type_check
-class VaePileStateModel(struct.PyTreeNode):
+class VaePileStateModel(struct.PyTreeNode, eq=False):
     """A trained φ of the paper. A pytree: weights and the mean map are leaves.
 
     Nothing keeps its volume: see `wlplan.models.phi.HeightChangeModel` for one that does.

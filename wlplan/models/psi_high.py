@@ -150,7 +150,7 @@ class PsiHigh(nnx.Module):
 
 
 @no_type_check
-class HighPerformanceModel(PerformanceModel):
+class HighPerformanceModel(PerformanceModel, eq=False):
     """A trained ψ_high; its view are the heights [m], 36 × 36. Running norms are leaves too."""
 
     view_variable: ClassVar[str] = "h36"

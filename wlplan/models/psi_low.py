@@ -58,7 +58,7 @@ class PsiLow(StandardisedMlp):
 
 
 @no_type_check
-class LowPerformanceModel(PerformanceModel):
+class LowPerformanceModel(PerformanceModel, eq=False):
     """A trained ψ_low; its view are the four characteristics [rad, rad, 1/m, 1/m]."""
 
     view_variable: ClassVar[str] = "characteristics"

@@ -68,7 +68,7 @@ class StallNetwork(nnx.Module):
 
 
 @no_type_check
-class StallModel(struct.PyTreeNode):
+class StallModel(struct.PyTreeNode, eq=False):
     """A trained predictor of stalls. A pytree: weights and normalisers are leaves.
 
     The weights are float32; with float64 inputs the arithmetic is in float64.

@@ -55,7 +55,7 @@ class Strip(struct.PyTreeNode):
 
 
 @no_type_check
-class LocalChange(struct.PyTreeNode):
+class LocalChange(struct.PyTreeNode, eq=False):
     """A learned φ changes the local heightmap, which is written back. Paper, section 4.5.
 
     Where φ says `conserves_volume`, the load is exactly what leaves the pile. Otherwise the pile

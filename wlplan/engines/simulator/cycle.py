@@ -433,7 +433,8 @@ def side_by_side(play: Callable[..., Any]) -> Callable[..., Any]:
     play = jax.custom_batching.custom_vmap(play)
 
     @play.def_vmap
-    def play_batch(size: int, batched: Sequence[Any], *arguments: Any) -> tuple[Any, Any]:
+    def play_batch(size: Any, batched: Sequence[Any], *arguments: Any) -> tuple[Any, Any]:
+        # The size is a whole number, or a symbol for one while the function is exported.
         def join(leaf: Array, is_batched: bool) -> Array:
             leaf = leaf if is_batched else jnp.broadcast_to(leaf, (size, *leaf.shape))
             return jnp.moveaxis(leaf, 0, -2).reshape(*leaf.shape[1:-1], -1)
