@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import click
 
-from wlplan.cli import benchmark, gradients, info, kept, learning, maps, planning, programs
+from wlplan.cli import benchmark, gradients, info, kept, learning, maps, planning, programs, serving
 from wlplan.errors import InputError
 
 # Commands in which nothing is compiled.
@@ -56,8 +56,9 @@ def wlplan(context: click.Context) -> None:
 
 # In the order in which people use them, which is that of the help.
 for _command in (
-    *(info.info, planning.plan, planning.simulate, maps.diggability, learning.collect),
-    *(learning.train, learning.evaluate, gradients.gradcheck, benchmark.bench, kept.cache),
+    *(info.info, planning.plan, planning.simulate, serving.serve, maps.diggability),
+    *(learning.collect, learning.train, learning.evaluate, gradients.gradcheck, benchmark.bench),
+    kept.cache,
 ):
     wlplan.add_command(_command)
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import jax
+import numpy as np
+from jaxtyping import Float
 
 from wlplan.planning import plan as planning
 from wlplan.planning.amounts import Amount
@@ -82,6 +85,11 @@ class MadePlan:
     simulator: World
     violated: dict[str, list[int]]
 
+    @functools.cached_property
+    def heights(self) -> Float[np.ndarray, "n nx ny"]:
+        """As each load leaves them in the simulator [m]; it plays the plan once more."""
+        return heights_after(self.simulator, self.pile, self.simulated.plan)
+
     def write(
         self, folder: Path, *, settings: Mapping[str, str], also: Sequence[str] = ()
     ) -> list[str]:
@@ -93,7 +101,7 @@ class MadePlan:
             self.simulated,
             site=self.site,
             predicted=self.planned.rollout.performance,
-            heights=heights_after(self.simulator, self.pile, self.simulated.plan),
+            heights=self.heights,
             settings=settings,
             also=also,
         )
