@@ -111,9 +111,13 @@ def serve(
                 with Stopwatch() as warming:
                     warmed(service, progress)
                 kept.remember("serve", warming.compiling)
-        _say(host, taken.getsockname()[1], server.is_loopback(host))
-        app = make_app(service, names=("localhost", host.lower()), log=_log)
-        server.run(app, taken, service.desk, remark)
+        server.run(
+            make_app(service, names=("localhost", host.lower()), log=_log),
+            taken,
+            service.desk,
+            beginning=lambda: _say(host, taken.getsockname()[1], server.is_loopback(host)),
+            note=remark,
+        )
     print("stopped")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import logging
+import signal
 import socket
 from collections.abc import Callable
 from types import FrameType
@@ -56,46 +57,77 @@ def bound(host: str, port: int) -> socket.socket:
     return taken
 
 
-class _Server(uvicorn.Server):
-    """Has the work at hand stop as soon as it is to end."""
+class Server(uvicorn.Server):
+    """A server that can be told what to do as it begins and as it is to end.
 
-    desk: Desk
-    say: Callable[[str], None]
+    Attributes:
+        beginning: Called once it listens.
+        ending: Called by Ctrl-C and SIGTERM; the second time nothing is waited for.
+    """
+
+    beginning: Callable[[], None] | None = None
+    ending: Callable[[], None] | None = None
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """What uvicorn does to listen."""
+        await super().startup(sockets)
+        if self.beginning is not None and self.started:
+            self.beginning()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Ctrl-C or SIGTERM; the second time it does not wait."""
-        if self.desk.pending() and not self.should_exit:
-            self.say("stopping what is computed; Ctrl-C again does not wait for it")
-        self.desk.stop_all()
+        """What uvicorn calls then."""
+        if self.ending is not None:
+            self.ending()
         super().handle_exit(sig, frame)
 
 
-def run(app: ASGIApp, taken: socket.socket, desk: Desk, say: Callable[[str], None]) -> None:
-    """Serves until Ctrl-C or SIGTERM.
+def made(app: ASGIApp) -> Server:
+    """A server of an application, which runs once its `run([socket])` is called."""
+    # What it would log is in our lines, or in the answers.
+    logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
+    return Server(
+        uvicorn.Config(
+            app,
+            http="h11",
+            ws="none",
+            lifespan="off",
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            limit_concurrency=_MOST_AT_ONCE,
+            timeout_graceful_shutdown=_PATIENCE,
+        )
+    )
+
+
+def run(
+    app: ASGIApp,
+    taken: socket.socket,
+    desk: Desk,
+    *,
+    beginning: Callable[[], None],
+    note: Callable[[str], None],
+) -> None:
+    """Serves until Ctrl-C or SIGTERM; of the main thread.
 
     Args:
         app: The application.
         taken: Of `bound`.
         desk: Is closed at the end.
-        say: Told what is worth knowing at the end.
+        beginning: Called once it listens.
+        note: Told what is worth knowing at the end.
     """
-    # What it would log is in our lines, or in the answers.
-    logging.getLogger("uvicorn").setLevel(logging.CRITICAL)
-    config = uvicorn.Config(
-        app,
-        http="h11",
-        ws="none",
-        lifespan="off",
-        log_config=None,
-        access_log=False,
-        server_header=False,
-        limit_concurrency=_MOST_AT_ONCE,
-        timeout_graceful_shutdown=_PATIENCE,
-    )
-    server = _Server(config)
-    server.desk, server.say = desk, say
+    server = made(app)
+
+    def ending() -> None:
+        if desk.pending() and not server.should_exit:
+            note("stopping what is computed; Ctrl-C again does not wait for it")
+        desk.stop_all()
+
+    server.beginning, server.ending = beginning, ending
+    # It ends by sending itself what ended it: SIGTERM is to end us no harder than Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        # It ends by sending itself what ended it.
         with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[taken])
     finally:

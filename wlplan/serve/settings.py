@@ -101,12 +101,10 @@ def _flag(value: Any) -> bool:
     return value
 
 
-def _truck(value: Any) -> tuple[float, ...] | str:
-    words = "[x, y], [x, y, heading in degrees], auto or each"
-    if value in ("auto", "each"):
-        return str(value)
-    found: tuple[float, ...] = _numbers(words, 2, 3).check(value)
-    return found
+def _truck(words: str, *others: str) -> Kind:
+    """A place, or one of some words."""
+    place = _numbers(words, 2, 3)
+    return Kind(lambda value: value if value in others else place.check(value))
 
 
 def _areas(value: Any) -> dict[str, Any]:
@@ -158,10 +156,17 @@ def choices(worlds: Collection[str], planners: Collection[str]) -> dict[str, Kin
     }
 
 
-PLACE = {"truck": Kind(_truck), "seed": _whole(0, 2**31 - 1)}
-"""Where the truck stands, and the seed."""
+_PLACE = "[x, y] or [x, y, heading in degrees]"
+NEXT_LOAD = {"truck": _truck(_PLACE), "seed": _whole(0, 2**31 - 1)}
+"""What else goes with a next load: where the loader dumps, and the seed."""
 
-PLANNING = {**AMOUNT, "referee": Kind(_flag), "background": Kind(_flag)}
+PLANNING = {
+    **AMOUNT,
+    **NEXT_LOAD,
+    "truck": _truck(f"{_PLACE}, auto or each", "auto", "each"),
+    "referee": Kind(_flag),
+    "background": Kind(_flag),
+}
 """What else goes with a plan."""
 
 

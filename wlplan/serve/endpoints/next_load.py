@@ -16,7 +16,7 @@ from wlplan.report.making import Told
 from wlplan.serve.answers import document_text, json_answer
 from wlplan.serve.incoming import finished, scan_and_settings
 from wlplan.serve.service import Service
-from wlplan.serve.settings import PLACE, SCAN, choices
+from wlplan.serve.settings import NEXT_LOAD, SCAN, choices
 from wlplan.serve.uploads import Upload
 from wlplan.types import LoadingPlan
 
@@ -27,7 +27,7 @@ async def answer(service: Service, request: Request) -> Response:
     """What is compiled serves scans of any extent, so a process that is warm takes no second."""
     names = choices(service.worlds.names, service.planners)
     del names["planner"]
-    upload, settings = await scan_and_settings(service, request, {**SCAN, **names, **PLACE})
+    upload, settings = await scan_and_settings(service, request, {**SCAN, **names, **NEXT_LOAD})
     job = service.desk.submit(lambda job: one_load(service, job.telling, upload, settings))
     return json_answer(await finished(job, request))
 

@@ -10,7 +10,7 @@ from starlette.responses import Response
 from wlplan.serve.answers import json_answer
 from wlplan.serve.incoming import finished, scan_and_settings
 from wlplan.serve.service import KeptPlan, Service
-from wlplan.serve.settings import PLACE, PLANNING, SCAN, choices
+from wlplan.serve.settings import PLANNING, SCAN, choices
 
 METHOD, PATH = "POST", "/plan"
 
@@ -18,9 +18,7 @@ METHOD, PATH = "POST", "/plan"
 async def answer(service: Service, request: Request) -> Response:
     """The plan once it is made; with `background` at once the job that makes it."""
     names = choices(service.worlds.names, service.planners)
-    upload, settings = await scan_and_settings(
-        service, request, {**SCAN, **names, **PLACE, **PLANNING}
-    )
+    upload, settings = await scan_and_settings(service, request, {**SCAN, **names, **PLANNING})
     job = service.desk.submit(lambda job: service.plan(job, upload, settings))
     if settings.get("background"):
         return json_answer(json.dumps({"job": job.id}), status=202, at=f"/jobs/{job.id}")

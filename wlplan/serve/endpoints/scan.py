@@ -32,7 +32,7 @@ def found_in(service: Service, job: Job, upload: Upload, settings: dict[str, Any
     job.telling.phase(f"reading {upload.name}")
     reading, areas = reading_of(settings)
     with upload.on_disk(areas) as (path, files):
-        survey = read_survey(path, **reading, **files)
+        survey = read_survey(path, **{**reading, **files})
         found = info(survey, soil=service.site.soil)
         notes = [upload.shown(note, path.parent) for note in found["notes"]]
     return document_text(

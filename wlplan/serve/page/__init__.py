@@ -29,7 +29,6 @@ def rendered(service: Service) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    machine = service.site.machine
     return environment.get_template("serve.html.j2").render(
         worlds=service.worlds.names,
         planners=service.planners,
@@ -39,8 +38,7 @@ def rendered(service: Service) -> str:
         facts={
             "endings": ENDINGS,
             "most_bytes": service.most_bytes,
-            "truck": truck_outline(machine),
-            "loader": (machine.length, machine.width),
+            "truck": truck_outline(service.site.machine),
         },
     )
 

@@ -76,8 +76,9 @@
   }
 
   function show(scan) {
-    state.scan = scan;
-    Object.assign(state, { areas: [], drawn: null, truck: null });
+    view = null;  // nothing is drawn until all is there
+    Object.assign(state, { scan, areas: [], drawn: null, truck: null });
+    listAreas();
     forget();
     for (const name of ["truck-x", "truck-y", "truck-heading"]) at(name).value = "";
     if (at("truck-how").value === "place") { at("truck-how").value = ""; truckHow(); }
@@ -133,11 +134,13 @@
 
   // --- the map: a view in metres of the scan, from its lower left corner
 
+  const BESIDE = 8;
   let view = null, cross = null;
   const local = ([x, y]) => [x - state.box.x, y - state.box.y];
   function whole() {
     const { clientWidth: w, clientHeight: h } = map, box = state.box;
-    const scale = Math.max(box.w / w, box.h / h) * 1.06;
+    // Trucks often stand beside the scan.
+    const scale = Math.max((box.w + 2 * BESIDE) / w, (box.h + 2 * BESIDE) / h);
     view = { x: 0.5 * (box.w - scale * w), y: 0.5 * (box.h - scale * h), scale };
   }
   // A point on the screen, in the coordinates of the scan.
@@ -157,7 +160,7 @@
   const tool = () => document.querySelector("input[name=tool]:checked").value;
 
   function drawAll() {
-    if (!state.scan) return;
+    if (!view) return;
     const { clientWidth: w, clientHeight: h } = map;
     map.setAttribute("viewBox", `0 0 ${w} ${h}`);
     at("flipped").setAttribute("transform",
