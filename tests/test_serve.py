@@ -244,7 +244,9 @@ def test_a_plan_in_the_background_tells_and_stops(
         if found.get("total"):
             break
         time.sleep(0.02)
-    assert re.fullmatch(r"planning, \d+ s; steps 1 of 2; cost 3\.00", found["said"])
+    assert re.fullmatch(
+        r"planning, \d+ s;( \d+ programs compiled;)? steps 1 of 2; cost 3\.00", found["said"]
+    )
     assert (found["state"], found["done"], found["total"]) == ("running", 1, 2)
     assert served.ask("GET", "/health").json()["state"] == "busy"
     # What comes next waits, and is told so.

@@ -15,6 +15,7 @@ from typing import Any
 
 from wlplan.errors import InputError
 from wlplan.serve.answers import Refused
+from wlplan.serve.compiled import compiled, listen
 
 # Pieces of work that may wait, and those that are remembered once they are done.
 _MOST_WAITING, _REMEMBERED = 8, 64
@@ -24,7 +25,7 @@ class Telling:
     """How far a piece of work is: what begins, and the stage, as planners tell it."""
 
     def __init__(self) -> None:
-        self._phase, self._since = "", time.monotonic()
+        self._phase, self._since, self._first = "", time.monotonic(), compiled()
         self._stage: tuple[str, int, int, float | None] | None = None
 
     def phase(self, text: str) -> None:
@@ -39,6 +40,8 @@ class Telling:
         """What is going on: `said` in words, and `done` of `total` where that is known."""
         seconds, stage = time.monotonic() - self._since, self._stage
         words = [f"{self._phase}, {seconds:.0f} s"] if self._phase else []
+        if programs := compiled() - self._first:
+            words.append(f"{programs} programs compiled")
         if stage is None:
             return {"said": "; ".join(words), "done": None, "total": None}
         name, done, total, cost = stage
@@ -99,6 +102,7 @@ class Desk:
         self._queue: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._numbers = itertools.count()
         self._lock = threading.Lock()
+        listen()
         self._thread = threading.Thread(target=self._work, name="desk", daemon=True)
         self._thread.start()
 

@@ -8,6 +8,9 @@ from wlplan.serve.endpoints.next_load import one_load
 from wlplan.serve.service import Service
 from wlplan.serve.uploads import BUNDLED
 
+# A place beside the bundled pile [m].
+_BESIDE = (-6.0, 4.0)
+
 
 def warmed(service: Service, progress: Told) -> None:
     """Loads the models, and plans a next load from the bundled pile.
@@ -23,4 +26,6 @@ def warmed(service: Service, progress: Told) -> None:
     service.world_of({})
     _ = service.simulator
     progress.phase("compiling the search of a next load")
-    one_load(service, Telling(), service.uploads.find(BUNDLED), {})
+    # With a truck whose heading is to be found, and with one whose place is.
+    for settings in ({"truck": _BESIDE}, {}):
+        one_load(service, Telling(), service.uploads.find(BUNDLED), settings)
