@@ -6,6 +6,7 @@ import io
 import json
 import math
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -599,24 +600,31 @@ def test_loopback_is_told_from_the_rest() -> None:
     assert not any(map(server.is_loopback, ("0.0.0.0", "::", "192.168.1.2", "host.example")))
 
 
-def test_it_starts_answers_and_ends_by_ctrl_c(pile_file: Path) -> None:
-    words = [sys.executable, "-m", "wlplan", "serve", "--cold", "--port", "0", "--host", "0.0.0.0"]
+@contextlib.contextmanager
+def started(*words: str) -> Iterator[tuple[subprocess.Popen[str], Served]]:
+    """A process that serves, and what asks it; it is interrupted at the end."""
+    command = [sys.executable, "-m", "wlplan", "serve", "--cold", "--port", "0", *words]
     with subprocess.Popen(
-        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
         first = process.stdout.readline()
         try:
             found = re.fullmatch(
-                r"http://0\.0\.0\.0:(\d+)/ answers: open it in a browser; Ctrl-C ends it\n", first
+                r"http://[\d.]+:(\d+)/ answers: open it in a browser; Ctrl-C ends it\n", first
             )
             assert found, first
-            here = Served(None, int(found[1]), [])  # type: ignore[arg-type]
-            assert here.ask("GET", "/health").json()["worlds"][0] == "hybrid"
-            described = here.ask("POST", "/scan?name=heap.npz", pile_file.read_bytes())
-            assert described.json()["volume"] > 10.0
+            yield process, Served(None, int(found[1]), [])  # type: ignore[arg-type]
         finally:
-            process.send_signal(2)
+            process.send_signal(signal.SIGINT)
+
+
+def test_it_starts_answers_and_ends_by_ctrl_c(pile_file: Path) -> None:
+    with started("--host", "0.0.0.0") as (process, here):
+        assert here.ask("GET", "/health").json()["worlds"][0] == "hybrid"
+        described = here.ask("POST", "/scan?name=heap.npz", pile_file.read_bytes())
+        assert described.json()["volume"] > 10.0
+        process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 0
     *lines, last = out.splitlines()
@@ -627,6 +635,32 @@ def test_it_starts_answers_and_ends_by_ctrl_c(pile_file: Path) -> None:
     ]
     assert "there is no password" in err
     assert "Traceback" not in err
+
+
+@pytest.mark.slow
+def test_ctrl_c_twice_does_not_wait_for_what_is_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WLPLAN_CACHE", str(tmp_path / "programs"))
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    with started() as (process, here):
+        job = here.ask("POST", "/plan", {"scan": "bundled", "background": True}).json()["job"]
+        for _ in range(600):
+            found = here.ask("GET", f"/jobs/{job}").json()
+            if re.search(r"planning, \d\d s", found["said"]):
+                break
+            time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    assert process.returncode in (0, 130)
+    assert out.endswith("stopped\n")
+    assert "Ctrl-C again does not wait" in err
+    assert "terminate" not in err
+    # It came to its end: what it has compiled is kept.
+    (folder,) = (tmp_path / "programs").iterdir()
+    assert list((folder / "running").iterdir()) == []
 
 
 def test_a_plan_text_has_no_nan() -> None:

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 from typing import Any
 
 import click
 
+from wlplan.cli import programs
 from wlplan.cli.inputs import check_models, model_fields, planner_named, site_named, world_named
 from wlplan.cli.options import model_options, planner_option, site_options, world_option
 from wlplan.cli.outputs import remark
-from wlplan.cli.programs import cache_of_command
 from wlplan.cli.progress import Progress, Stopwatch
 from wlplan.cli.verbosity import is_asked, quiet_or_verbose
 from wlplan.errors import InputError
 from wlplan.worlds.names import FOR_PLANNING
 
+# Exit code after a second Ctrl-C.
+_INTERRUPTED = 130
 _INSTALL = "wlplan[serve]"
 
 
@@ -85,7 +88,7 @@ def serve(
     check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
     server = _library()
-    kept = cache_of_command()
+    kept = programs.cache_of_command()
     with contextlib.closing(server.bound(host, port)) as taken:
         with Progress(kept.seconds("serve")) as progress:
             progress.phase("starting")
@@ -111,14 +114,17 @@ def serve(
                 with Stopwatch() as warming:
                     warmed(service, progress)
                 kept.remember("serve", warming.compiling)
-        server.run(
+        ended = server.run(
             make_app(service, names=("localhost", host.lower()), log=_log),
             taken,
             service.desk,
             beginning=lambda: _say(host, taken.getsockname()[1], server.is_loopback(host)),
             note=remark,
         )
-    print("stopped")
+    print("stopped", flush=True)
+    if not ended:
+        programs.end()
+        os._exit(_INTERRUPTED)
 
 
 def _library() -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import itertools
 import queue
@@ -146,11 +147,21 @@ class Desk:
         for job in self.pending():
             job.stop()
 
-    def close(self, patience: float) -> None:
-        """Stops all work and waits for the thread to end, but for so long [s] at most."""
+    def close(self, patience: float | None = None) -> bool:
+        """Stops all work and waits for the thread to end, but for Ctrl-C.
+
+        Args:
+            patience: For so long at most [s]; None: however long.
+
+        Returns:
+            Whether it has ended. A process with one that has not must end by `os._exit`: a thread
+            that is inside of XLA when Python goes down takes all down with a crash.
+        """
         self.stop_all()
         self._queue.put(None)
-        self._thread.join(patience)
+        with contextlib.suppress(KeyboardInterrupt):
+            self._thread.join(patience)
+        return not self._thread.is_alive()
 
     def _work(self) -> None:
         while (job := self._queue.get()) is not None:

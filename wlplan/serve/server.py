@@ -16,8 +16,8 @@ from starlette.types import ASGIApp
 from wlplan.errors import InputError, one_line
 from wlplan.serve.desk import Desk
 
-# Requests at once, and how long those at hand may take once it ends [s].
-_MOST_AT_ONCE, _PATIENCE = 64, 10
+# Requests at once.
+_MOST_AT_ONCE = 64
 
 
 def is_loopback(host: str) -> bool:
@@ -95,7 +95,6 @@ def made(app: ASGIApp) -> Server:
             access_log=False,
             server_header=False,
             limit_concurrency=_MOST_AT_ONCE,
-            timeout_graceful_shutdown=_PATIENCE,
         )
     )
 
@@ -107,8 +106,8 @@ def run(
     *,
     beginning: Callable[[], None],
     note: Callable[[str], None],
-) -> None:
-    """Serves until Ctrl-C or SIGTERM; of the main thread.
+) -> bool:
+    """Serves until Ctrl-C or SIGTERM, in the main thread.
 
     Args:
         app: The application.
@@ -116,6 +115,9 @@ def run(
         desk: Is closed at the end.
         beginning: Called once it listens.
         note: Told what is worth knowing at the end.
+
+    Returns:
+        Whether nothing is computed any more, see `Desk.close`.
     """
     server = made(app)
 
@@ -127,8 +129,9 @@ def run(
     server.beginning, server.ending = beginning, ending
     # It ends by sending itself what ended it: SIGTERM is to end us no harder than Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        with contextlib.suppress(KeyboardInterrupt):
-            server.run(sockets=[taken])
-    finally:
-        desk.close(0.0 if server.force_exit else _PATIENCE)
+    with contextlib.suppress(KeyboardInterrupt):
+        server.run(sockets=[taken])
+    ended = desk.close(0.0 if server.force_exit else None)
+    # Nothing is left that one more Ctrl-C could stop.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return ended

@@ -39,6 +39,7 @@ def rendered(service: Service) -> str:
             "endings": ENDINGS,
             "most_bytes": service.most_bytes,
             "truck": truck_outline(service.site.machine),
+            "approach": service.site.machine.approach_distance,
         },
     )
 

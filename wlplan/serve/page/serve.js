@@ -217,8 +217,11 @@
   }
   function drawTruck() {
     const inside = [];
-    if (state.truck) inside.push(...stand(...state.truck));
-    else if (state.plan) for (const one of stands(state.plan)) inside.push(...stand(...one));
+    const planned = state.plan ? stands(state.plan) : [];
+    // What was planned says the heading that was left open.
+    const same = (one) => state.truck && Math.hypot(one[0] - state.truck[0], one[1] - state.truck[1]) < 0.01;
+    if (state.truck && !planned.some(same)) inside.push(...stand(...state.truck));
+    for (const one of planned) if (!state.truck || same(one)) inside.push(...stand(...one));
     at("truck").replaceChildren(...inside);
   }
   function stands(plan) {
@@ -237,7 +240,7 @@
             stroke: "#1d2733", "stroke-opacity": 0.5, "stroke-width": 1.5 * px, ...(leg.gear < 0 ? { "stroke-dasharray": `${5 * px} ${4 * px}` } : {}) }));
       state.plan.loads.forEach((load, n) => {
         const [x, y] = local([load.x + dx, load.y + dy]), into = load.heading;
-        digs.push(made("svg:path", { d: `M ${x - 2.2 * Math.cos(into)} ${y - 2.2 * Math.sin(into)} L ${x} ${y}`, stroke: "#1f5fa8", "stroke-width": 4 * px }),
+        digs.push(made("svg:path", { d: `M ${x - facts.approach * Math.cos(into)} ${y - facts.approach * Math.sin(into)} L ${x} ${y}`, stroke: "#1f5fa8", "stroke-width": 2.5 * px }),
           made("svg:circle", { cx: x, cy: y, r: 9 * px, fill: "#1f5fa8", stroke: "#fff", "stroke-width": px }),
           made("svg:text", { transform: `translate(${x} ${y}) scale(${px} ${-px})`, "font-size": 11 }, String(n + 1)));
       });
