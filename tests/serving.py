@@ -72,11 +72,11 @@ class Served:
 
     def until(self, job: str, state: str) -> Any:
         """What is known of a job once it is in a state."""
-        for _ in range(600):
+        for _ in range(1000):
             found = self.ask("GET", f"/jobs/{job}").json()
             if found["state"] == state:
                 return found
-            time.sleep(0.02)
+            time.sleep(0.05)
         raise AssertionError(f"{found} and never {state}")
 
 
@@ -100,7 +100,7 @@ def serving(world: World = bowl_world, planner: Any = "greedy") -> Iterator[Serv
     try:
         yield Served(service, taken.getsockname()[1], lines)
     finally:
-        service.desk.close(5.0)
+        service.desk.close()
         running.should_exit = True
         thread.join(10.0)
         taken.close()

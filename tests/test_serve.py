@@ -240,11 +240,11 @@ def test_a_plan_in_the_background_tells_and_stops(
     assert answer.status == 202
     job = answer.json()["job"]
     assert answer.headers["content-location"] == f"/jobs/{job}"
-    for _ in range(200):
+    for _ in range(1000):
         found = served.ask("GET", f"/jobs/{job}").json()
         if found.get("total"):
             break
-        time.sleep(0.02)
+        time.sleep(0.05)
     assert re.fullmatch(
         r"planning, \d+ s;( \d+ programs compiled;)? steps 1 of 2; cost 3\.00", found["said"]
     )
@@ -309,7 +309,7 @@ def test_too_much_that_waits_is_refused() -> None:
     assert refused.value.status == 503
     go.set()
     assert all(job.future.result(20.0) for job in jobs)
-    desk.close(5.0)
+    desk.close()
 
 
 def test_what_is_stopped_without_a_result_says_so() -> None:
@@ -322,7 +322,7 @@ def test_what_is_stopped_without_a_result_says_so() -> None:
     job = desk.submit(work)
     job.stop()
     assert job.future.cancelled() or "stopped before" in str(job.future.exception(20.0))
-    desk.close(5.0)
+    desk.close()
 
 
 def test_a_watch_asks_whether_to_stop() -> None:
@@ -654,7 +654,7 @@ def test_ctrl_c_twice_does_not_wait_for_what_is_compiled(
         time.sleep(1.0)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
-    assert process.returncode in (0, 130)
+    assert process.returncode in (0, 130), (out, err)
     assert out.endswith("stopped\n")
     assert "Ctrl-C again does not wait" in err
     assert "terminate" not in err

@@ -140,6 +140,7 @@ def make_plan(
     goal = objective_of(asked.objective)
     in_simulator = asked.names["world"] == "simulator"
     at = asked.truck
+    progress.phase("placing the truck")
     place = site.with_receiver(named, at if isinstance(at, tuple) else None, note=note)
     progress.phase("planning")
     with timed("planning"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import contextlib
 import dataclasses
 import itertools
 import queue
@@ -20,6 +19,8 @@ from wlplan.serve.compiled import compiled, listen
 
 # Pieces of work that may wait, and those that are remembered once they are done.
 _MOST_WAITING, _REMEMBERED = 8, 64
+# So often it is looked whether to wait on [s].
+_LOOK = 0.2
 
 
 class Telling:
@@ -147,11 +148,11 @@ class Desk:
         for job in self.pending():
             job.stop()
 
-    def close(self, patience: float | None = None) -> bool:
-        """Stops all work and waits for the thread to end, but for Ctrl-C.
+    def close(self, waits: Callable[[], bool] = lambda: True) -> bool:
+        """Stops all work and waits for the thread to end.
 
         Args:
-            patience: For so long at most [s]; None: however long.
+            waits: Whether it waits on; asked now and then.
 
         Returns:
             Whether it has ended. A process with one that has not must end by `os._exit`: a thread
@@ -159,8 +160,8 @@ class Desk:
         """
         self.stop_all()
         self._queue.put(None)
-        with contextlib.suppress(KeyboardInterrupt):
-            self._thread.join(patience)
+        while self._thread.is_alive() and waits():
+            self._thread.join(_LOOK)
         return not self._thread.is_alive()
 
     def _work(self) -> None:

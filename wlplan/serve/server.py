@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import ipaddress
 import logging
 import signal
@@ -16,8 +15,8 @@ from starlette.types import ASGIApp
 from wlplan.errors import InputError, one_line
 from wlplan.serve.desk import Desk
 
-# Requests at once.
-_MOST_AT_ONCE = 64
+# Requests at once, and signals after which nothing is waited for.
+_MOST_AT_ONCE, _ENOUGH = 64, 2
 
 
 def is_loopback(host: str) -> bool:
@@ -127,11 +126,14 @@ def run(
         desk.stop_all()
 
     server.beginning, server.ending = beginning, ending
-    # It ends by sending itself what ended it: SIGTERM is to end us no harder than Ctrl-C.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with contextlib.suppress(KeyboardInterrupt):
-        server.run(sockets=[taken])
-    ended = desk.close(0.0 if server.force_exit else None)
-    # Nothing is left that one more Ctrl-C could stop.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # It ends by sending itself what ended it. Our handlers only count: an exception from them could
+    # come anywhere, and SIGTERM is to end us no harder than Ctrl-C.
+    signals: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda sig, frame: signals.append(sig))
+    server.run(sockets=[taken])
+    ended = desk.close(lambda: len(signals) < _ENOUGH)
+    # As Python goes down it forgets handlers, and one more would kill it: nothing is left to end.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     return ended
