@@ -65,12 +65,12 @@ NEWEST_PYTHON := $(shell for v in 3.14 3.13 3.12 3.11; do python$$v -c "" 2>/dev
 
 $(VENV)-lowest/.tools: $(VENV)/.tools
 	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(VENV)-lowest
-	$(BIN)/uv pip install --quiet --python $(VENV)-lowest --resolution lowest-direct -e '.[scan,dev]'
+	$(BIN)/uv pip install --quiet --python $(VENV)-lowest --resolution lowest-direct -e '.[scan,serve,dev]'
 	@touch $@
 
 $(VENV)-newest/.tools: $(VENV)/.tools
 	$(BIN)/uv venv --quiet --clear --python $(or $(NEWEST_PYTHON),$(BIN)/python) $(VENV)-newest
-	$(BIN)/uv pip install --quiet --python $(VENV)-newest --upgrade -e '.[scan,dev]'
+	$(BIN)/uv pip install --quiet --python $(VENV)-newest --upgrade -e '.[scan,serve,dev]'
 	@touch $@
 
 # What one library calls of another may be deprecated in versions that are not the pinned ones, and

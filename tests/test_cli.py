@@ -927,7 +927,9 @@ def test_collect_takes_soil_and_machine(
 def test_every_command_explains_itself_and_has_the_common_options(run: Run, command: str) -> None:
     code, out, err = run(command, "--help")
     assert (code, err) == (0, "")
-    for option in ("--seed", "--json", "--help"):
+    # A service gets seeds, and gives JSON, request by request.
+    common = ("--quiet", "--help") if command == "serve" else ("--seed", "--json", "--help")
+    for option in common:
         assert option in out
 
 

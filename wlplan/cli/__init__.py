@@ -27,6 +27,7 @@ from wlplan.cli import (
     maps,
     planning,
     programs,
+    serving,
 )
 from wlplan.errors import InputError
 
@@ -66,9 +67,9 @@ def wlplan(context: click.Context) -> None:
 
 # In the order in which people use them, which is that of the help.
 for _command in (
-    *(info.info, planning.plan, planning.simulate, maps.diggability, learning.collect),
-    *(learning.train, learning.evaluate, exporting.export, gradients.gradcheck),
-    *(benchmark.bench, kept.cache),
+    *(info.info, planning.plan, planning.simulate, serving.serve, maps.diggability),
+    *(learning.collect, learning.train, learning.evaluate, exporting.export),
+    *(gradients.gradcheck, benchmark.bench, kept.cache),
 ):
     wlplan.add_command(_command)
 

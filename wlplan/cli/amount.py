@@ -8,11 +8,18 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wlplan.cli.values import FiniteRange
+from wlplan.constants import (
+    EXCHANGES,
+    MOST_LOADS,
+    MOST_REMAINING,
+    MOST_TONNES,
+    MOST_TRUCKS,
+    PAYLOADS,
+)
 
 if TYPE_CHECKING:
     from wlplan.planning.amounts import Amount
 
-_MOST_LOADS, _MOST_TONNES, _MOST_TRUCKS = 500, 2_000.0, 50
 _DEFAULT = 15
 
 
@@ -65,32 +72,32 @@ def amount_options(command: Any) -> Any:
 _OPTIONS = (
     click.option(
         "--loads",
-        type=click.IntRange(1, _MOST_LOADS),
+        type=click.IntRange(1, MOST_LOADS),
         default=None,
         help=f"Number of bucket loads. Default: {_DEFAULT}, if no other amount is given.",
     ),
     click.option(
         "--tonnes",
-        type=FiniteRange(0.0, _MOST_TONNES, min_open=True),
+        type=FiniteRange(0.0, MOST_TONNES, min_open=True),
         default=None,
         help="Tonnes to be loaded, in as many loads as it takes.",
     ),
     click.option(
         "--trucks",
-        type=click.IntRange(1, _MOST_TRUCKS),
+        type=click.IntRange(1, MOST_TRUCKS),
         default=None,
         help="Number of trucks to be filled, each with whole buckets to its --payload.",
     ),
     click.option(
         "--payload",
-        type=FiniteRange(1.0, 500.0),
+        type=FiniteRange(*PAYLOADS),
         default=None,
         help="Payload of a truck [t]: it is met to 5 % where that can be done, and never "
         "exceeded by more than 10 %.",
     ),
     click.option(
         "--exchange",
-        type=FiniteRange(0.0, 3600.0),
+        type=FiniteRange(*EXCHANGES),
         default=None,
         help="How long the loader waits from one truck to the next [s]. Default: 30.",
     ),
@@ -101,7 +108,7 @@ _OPTIONS = (
     ),
     click.option(
         "--remaining",
-        type=FiniteRange(0.0, 99.0),
+        type=FiniteRange(0.0, MOST_REMAINING),
         default=None,
         help="With --empty: part of the volume that may remain [%]. Default: 2.",
     ),

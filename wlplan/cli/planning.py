@@ -112,92 +112,58 @@ def plan(
         progress.phase("starting")
 
         from wlplan.io.files import atomic_folder
-        from wlplan.planning.objective import objective_of
-        from wlplan.planning.piles import heights_after
-        from wlplan.planning.plan import plan_loads, play
-        from wlplan.report.document import plan_document, violations_of, write_plan_folder
+        from wlplan.report.making import Asked, make_plan
 
         progress.phase(f"reading {pile_file.name}")
         named = pile_named(pile_file, site.machine)
-        pile = named.pile
         progress.phase("loading the models")
         world = world_named(world_name, site, model, pile_state)
         simulator = world_named("simulator", site)
         wanted = amount()
         objective = wanted.objective if objective is None else objective
-        goal = objective_of(objective_named(objective))
-        chosen = planner_named(planner)
-        in_simulator = world_name == "simulator"
-        place = site.with_receiver(named, truck if isinstance(truck, tuple) else None)
-        progress.phase("planning")
-        with Stopwatch() as planning:
-            planned = ready(
-                plan_loads(
-                    world,
-                    pile,
-                    amount=wanted,
-                    objective=goal,
-                    planner=chosen,
-                    site=place,
-                    truck=truck if isinstance(truck, str) else None,
-                    seed=seed,
-                    referee=simulator if referee and not in_simulator else None,
-                    progress=progress,
-                    contour=named.contour,
-                )
-            )
-        kept.remember(kind, planning.compiling)
-        place = place.replace(receiver=planned.receiver)
-        progress.phase("playing the plan in the simulator")
-        with Stopwatch() as playing:
-            simulated = planned.refereed or planned
-            if planned.refereed is None and not in_simulator:
-                simulated = ready(
-                    play(simulator, pile, planned.plan, objective=goal, amount=wanted, site=place)
-                )
-        document = plan_document(
-            pile,
-            simulated,
-            site=place,
-            predicted=planned.rollout.performance,
-            predicted_cost=float(planned.cost),
-            deviation=planned.deviation,
-            stall_probability=planned.stall_probability,
-            amount=wanted,
-            stopped=planned.stopped,
-            seen=getattr(world, "faces_seen", None),
-            pile=named.fields,
-            **site.fields(),
-            world=world_name,
-            planner=planner,
-            objective=objective,
-            referee=referee,
-            seed=seed,
-            **model_fields(model, pile_state),
+        clocks: dict[str, Stopwatch] = {}
+
+        def timed(part: str) -> Stopwatch:
+            clocks[part] = Stopwatch()
+            return clocks[part]
+
+        made = make_plan(
+            named,
+            site,
+            world,
+            simulator,
+            Asked(
+                amount=wanted,
+                truck=truck,
+                planner=planner_named(planner),
+                objective=objective_named(objective),
+                names={
+                    "world": world_name,
+                    "planner": planner,
+                    "objective": objective,
+                    **model_fields(model, pile_state),
+                },
+                referee=referee,
+                seed=seed,
+            ),
+            progress=progress,
+            timed=timed,
+            note=remark,
         )
+        kept.remember(kind, clocks["planning"].compiling)
+        document = made.document
         text = json_text(document)
-        seconds = {"planning": planning.text()}
-        if planned.refereed is None:
-            seconds["simulator"] = playing.text()
+        seconds = {part: clock.text() for part, clock in clocks.items()}
         written = None
         if folder is not None:
             progress.phase("drawing")
+            settings = {f"{name}, wall clock": text for name, text in seconds.items()}
             with atomic_folder(folder, existing="add") as staging:
-                written = write_plan_folder(
-                    staging,
-                    document,
-                    pile,
-                    simulated,
-                    site=place,
-                    predicted=planned.rollout.performance,
-                    heights=heights_after(simulator, pile, simulated.plan),
-                    settings={f"{name}, wall clock": text for name, text in seconds.items()},
-                    also=also,
-                )
+                written = made.write(staging, settings=settings, also=also)
     for note in document["notes"]:
         remark(note)
     remark_on_ledger(document["ledger"])
-    for name, numbers in violations_of(planned, goal.constraints).items():
+    for name, numbers in made.violated.items():
         remark(f"{name} is violated by load {', '.join(map(str, numbers))}")
     if as_json:
         click.echo(text)
@@ -205,7 +171,7 @@ def plan(
         print_plan(document)
         print("; ".join(f"{name} {text}" for name, text in seconds.items()))
         _print_written(folder, written)
-    if planned.stopped == "interrupted":
+    if made.planned.stopped == "interrupted":
         raise click.exceptions.Exit(_INTERRUPTED)
 
 
@@ -302,9 +268,11 @@ def simulate(
     objective = objective if objective in OBJECTIVES else next(iter(OBJECTIVES))
     places = None if truck is not None else _places_of_trucks(given, frame)
     if places is None:
-        place = site.with_receiver(named, truck if truck is not None else _truck_of(given, frame))
+        place = site.with_receiver(
+            named, truck if truck is not None else _truck_of(given, frame), note=remark
+        )
     else:
-        place = site.with_receivers(named, places)
+        place = site.with_receivers(named, places, note=remark)
     with named_file(Path(plan_file)):
         amount = amount_recorded(given.get("job"))
     cycles: list[Any] = []

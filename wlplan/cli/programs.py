@@ -11,6 +11,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import importlib.metadata
 import importlib.util
@@ -20,7 +21,7 @@ import platform
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import click
@@ -189,11 +190,22 @@ def _used(folder: Path) -> Cache:
     _prune()
     mark = filelock.FileLock(running / f"{os.getpid()}-{time.time_ns():x}")
     mark.acquire(timeout=0)
-    atexit.register(_at_the_end, folder, mark, os.getpid())
+    _ends.append(functools.partial(_at_the_end, folder, mark, os.getpid()))
+    atexit.register(end)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(_QUICK))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
     return Cache(folder)
+
+
+# What is done as this process comes to its end.
+_ends: list[Callable[[], None]] = []
+
+
+def end() -> None:
+    """Says that this process came to its end; for one that ends without telling Python."""
+    while _ends:
+        _ends.pop()()
 
 
 def _at_the_end(folder: Path, mark: object, process: int) -> None:

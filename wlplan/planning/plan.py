@@ -65,11 +65,12 @@ def plan_loads(
     mend: bool = True,
     progress: Progress | None = None,
     budget: int | None = None,
+    stop: Callable[[], bool] | None = None,
     contour: ToeContour | None = None,
 ) -> PlanResult:
     """Plans the next loadings from a pile.
 
-    Ctrl-C and a budget end the search: the best plan so far is the result, which says so.
+    Ctrl-C, `stop` and a budget end the search: the best plan so far is the result, which says so.
 
     Args:
         world: World to plan in.
@@ -95,6 +96,8 @@ def plan_loads(
             hold for that.
         progress: Called as the planner advances.
         budget: Most that a search may spend, in loadings, see `wlplan.planning.watch.EFFORTS`.
+        stop: Asked now and then; once it returns True the search ends, as by Ctrl-C, which only
+            the main thread of a process hears of.
         contour: The toe to dig along; default: that of the pile.
 
     Returns:
@@ -121,7 +124,7 @@ def plan_loads(
     if referee is not None:
         checked = make_job(referee, pile, site=job.site, contour=contour).world
     chosen = planner_of(planner, job.world)
-    watch, made = Watch(progress, budget), Made()
+    watch, made = Watch(progress, budget, stop), Made()
     parts: list[PlanResult] = []
     typical = typical_load(job.site)
     if truck not in (None, *TRUCKS):

@@ -39,7 +39,7 @@ def best_place(job: Job, site: Site, rows: int, *, seed: int, watch: Watch) -> R
     spots = [best, *best_spots(job, seed=seed, watch=watch, closed=closed, area=area)]
     for number, receiver in enumerate(spots):
         watch("truck", number, len(spots), None if number == 0 else least)
-        at, quiet = at_receiver(job, receiver), Watch()
+        at, quiet = at_receiver(job, receiver), Watch(stop=watch.stop)
         candidates: Any = kind().propose(at, rows, seed=seed, progress=quiet).candidates
         watch.spend(loading=quiet.spent)
         cost = _per_tonne(outcomes(at, candidates))

@@ -6,7 +6,7 @@ So one place stops any planner, by a budget or by Ctrl-C, and nothing of what wa
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +46,7 @@ class Watch:
     Args:
         progress: Told how far it is.
         budget: Most that may be spent; a planner ends at the first report beyond it.
+        stop: Asked at each report; once it says so a planner ends, as by Ctrl-C.
 
     Attributes:
         spent: Evaluations so far, in loadings, see `EFFORTS`.
@@ -53,8 +54,13 @@ class Watch:
         stopped: What ended the search early: "", "budget" or "interrupted".
     """
 
-    def __init__(self, progress: Progress | None = None, budget: int | None = None):
-        self._progress, self._budget = progress, budget
+    def __init__(
+        self,
+        progress: Progress | None = None,
+        budget: int | None = None,
+        stop: Callable[[], bool] | None = None,
+    ):
+        self._progress, self._budget, self.stop = progress, budget, stop
         self.spent = 0.0
         self.best: Best | None = None
         self.stopped = ""
@@ -91,7 +97,10 @@ class Watch:
 
         Raises:
             BudgetSpent: If that is more than the budget.
+            KeyboardInterrupt: If it is to stop.
         """
+        if self.stop is not None and self.stop():
+            raise KeyboardInterrupt
         self.spent += sum(EFFORTS[kind] * count for kind, count in evaluations.items())
         if self._budget is not None and self.spent > self._budget:
             raise BudgetSpent

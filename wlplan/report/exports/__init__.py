@@ -71,5 +71,23 @@ def exported(kinds: Sequence[str], played: Played) -> dict[str, bytes]:
     return {module.NAME: module.content(played) for module in modules}
 
 
+def file_names() -> tuple[str, ...]:
+    """Names of the files of all kinds whose libraries are installed."""
+    return tuple(_module(kind).NAME for kind in KINDS if _is_there(kind))
+
+
+def kind_of(name: str) -> str | None:
+    """The kind that makes a file of a name; None if none does."""
+    return next((kind for kind in KINDS if name == _module(kind).NAME), None)
+
+
+def _is_there(kind: str) -> bool:
+    try:
+        check((kind,))
+    except InputError:
+        return False
+    return True
+
+
 def _module(kind: str) -> Any:
     return importlib.import_module(f"{__name__}.{kind}")
