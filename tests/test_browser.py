@@ -7,15 +7,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import wlplan
 from wlplan.planning.piles import heights_after
-from wlplan.report import figures
+from wlplan.report.figures import PlanOnPile
+from wlplan.report.legs import way as way_of
 from wlplan.report.page import render_report
+from wlplan.report.pictures import galleries_of
 from wlplan.report.scene import scene_of
+from wlplan.site.frame import frame_recorded
 from wlplan.site.receiver import Receiver
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 
@@ -54,6 +58,17 @@ def scene(kind: str) -> Pile:
     return pile
 
 
+def way(x: float, y: float, to_x: float, to_y: float) -> list[list[float]]:
+    """Straight back by 3 m, and straight to the truck."""
+    cusp = x - 3.0, y
+    ends = (((x, y), cusp, -1.0), (cusp, (to_x, to_y), 1.0))
+    return [
+        [a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), 0.5, gear]
+        for a, b, gear in ends
+        for part in np.linspace(0.0, 1.0, 12).tolist()
+    ]
+
+
 def page_of(pile: Pile, count: int, name: str = "scan.laz") -> str:
     """The page of a plan that digs all around."""
     angle = np.linspace(0.0, 2.0 * math.pi, count, endpoint=False)
@@ -67,12 +82,16 @@ def page_of(pile: Pile, count: int, name: str = "scan.laz") -> str:
     )
     heights = heights_after(dug, pile, plan)
     record = {"mass": 4.5, "time": 9.0, "work": 400.0}
+
+    def origin(n: int) -> tuple[float, float]:
+        return float(x[n] - 5.0 * np.cos(angle[n])), float(y[n] - 5.0 * np.sin(angle[n]))
+
     loads = [
         {
             **{"x": float(x[n]), "y": float(y[n]), "heading": float(angle[n])},
             "action": {"delta_bm": 0.65, "k_bm": 0.72, "delta_bk": 0.69, "k_bk": 0.83},
             **{"predicted": record, "simulated": record, "transport": record},
-            "path": {"points": [[x[n] - s, y[n] - s, 0.5, -1 if s < 3 else 1] for s in range(6)]},
+            "path": {"points": way(*origin(n), float(x.min()) - 6.0, float(y.min()))},
         }
         for n in range(count)
     ]
@@ -81,17 +100,32 @@ def page_of(pile: Pile, count: int, name: str = "scan.laz") -> str:
     document: dict[str, Any] = {
         "pile": {"file": name, "sha256": 64 * "0"},
         **{"world": "hybrid", "planner": "greedy", "objective": "efficiency", "seed": 0},
-        "total": {"predicted": sums, "simulated": sums, "transport": sums},
+        "total": {
+            **{"predicted": sums, "simulated": sums, "transport": sums},
+            "deviation": {"mass": 0.2, "time": 0.6, "work": 30.0},
+        },
         "ledger": {"volume_before": 90.0, "volume_after": 80.0, "density": 1.7, "mass_removed": 17},
         **{"loads": loads, "receiver": receiver, "notes": ["the truck stands on ground not seen"]},
         "frame": {"offset": [412000.0, 5310000.0, 0.0]},
     }
-    drawn = figures.plan_figure(
-        pile, pile.replace(height=heights[-1]), plan, receiver=Receiver(**receiver)
+    shown = PlanOnPile(
+        pile,
+        plan,
+        receiver=Receiver(**receiver),
+        ways=[way_of(load) for load in loads],
+        frame=frame_recorded(document),
     )
+    each = Performance(*(np.full(count, record[name]) for name in record))
     return render_report(
         document,
-        figures=[(figures.png_bytes(drawn), "The pile and the digs")],
+        galleries=galleries_of(
+            shown,
+            pile.replace(height=heights[-1]),
+            heights=heights,
+            predicted=each,
+            simulated=each,
+            deviation=Performance(*(0.02 * leaf for leaf in jax.tree.leaves(each))),
+        ),
         scene=scene_of(pile, heights, document),
     )
 

@@ -140,7 +140,7 @@ def fakes(
     monkeypatch.setattr(planner, "play", fake_play)
     monkeypatch.setattr(worlds, "load_world", load_world)
     if "real_figures" not in request.fixturenames:
-        for name in ("plan_figure", "totals_figure", "diggability_figure"):
+        for name in (one for one in plots.__all__ if one.endswith("_figure")):
             monkeypatch.setattr(plots, name, lambda *_, **__: Figure(figsize=(1.0, 1.0)))
 
 
@@ -965,10 +965,12 @@ def test_the_report_stands_alone_and_escapes_names(run: Run, tmp_path: Path) -> 
     assert "<b>&'x" not in source
     page = Page(source)
     assert name in page.text
-    assert len(page.links) == 2
+    # Two maps, and six charts.
+    assert len(page.links) == len(page.alts) == 8
     assert all((link or "").startswith("data:image/png;base64,") for link in page.links)
     # Ours: what is drawn, what draws, and what steers it.
     assert page.tags.count("script") == 3
+    assert len(source) < 6_000_000
 
 
 def test_progress_tells_rate_and_remaining_time(
