@@ -186,6 +186,21 @@ def paths_of(before: Pile, played: PlanResult, site: Site) -> list[dict[str, Any
     return found
 
 
+def deviation_of(document: Mapping[str, Any]) -> Performance | None:
+    """The standard deviations that a plan.json has for all of its loads; None if it lacks one."""
+    records = [load.get("deviation") for load in document["loads"]]
+    rows = [
+        [record.get(name) if isinstance(record, dict) else None for name in QUANTITIES]
+        for record in records
+    ]
+    known = all(
+        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and v >= 0.0
+        for row in rows
+        for v in row
+    )
+    return Performance(*np.array(rows, dtype=float).T) if rows and known else None
+
+
 def totals(performance: Performance, cost: float | None = None) -> dict[str, float]:
     """Sums of mass [tonne], time [s] and work [kJ] over the loads, and the cost if there is one."""
     sums = {quantity: _sum(getattr(performance, quantity)) for quantity in QUANTITIES}
@@ -269,7 +284,7 @@ def write_plan_folder(
     from wlplan.report.exports import Played, exported
     from wlplan.report.headline import key_figures
     from wlplan.report.page import REPORT_NAME, write_report
-    from wlplan.report.pictures import deviation_of, galleries_of
+    from wlplan.report.pictures import galleries_of
     from wlplan.report.scene import scene_of
 
     count, after = len(document["loads"]), simulated.rollout.pile

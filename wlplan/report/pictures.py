@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -61,21 +60,6 @@ def galleries_of(
     if heights is not None and count > 1:
         found.append(_steps(shown, heights))
     return [*found, _charts(predicted, simulated, deviation)]
-
-
-def deviation_of(document: Mapping[str, Any]) -> Performance | None:
-    """The standard deviations that a plan.json has for all of its loads; None if it lacks one."""
-    records = [load.get("deviation") for load in document["loads"]]
-    rows = [
-        [record.get(name) if isinstance(record, dict) else None for name in QUANTITIES]
-        for record in records
-    ]
-    known = all(
-        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and v >= 0.0
-        for row in rows
-        for v in row
-    )
-    return Performance(*np.array(rows, dtype=float).T) if rows and known else None
 
 
 def _picture(figure: Any, alt: str) -> Picture:
