@@ -169,6 +169,8 @@ def test_the_key_figures_of_a_picture_are_those_of_the_page() -> None:
     assert found["40.0 t"] == "in 10 loads\nforeseen 44.0 ± 2 t"
     assert "waiting" not in found["5\u00a0min 00\u00a0s"]
     assert key_figures({"loads": [{}], "total": {}})[0] == ("– t", "in 1 load")
+    trucks = [{"payload": 18.0, "mass": mass} for mass in (17.9, 18.2)]
+    assert key_figures({"trucks": trucks})[1] == ("2 trucks", "with 17.9 to 18.2 t\nof 18 t")
 
 
 def test_trucks_are_said_with_payload_and_last_bucket() -> None:

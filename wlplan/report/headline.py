@@ -100,7 +100,12 @@ def key_figures(document: Mapping[str, Any]) -> list[tuple[str, str]]:
             f"{said.number(job['mass'], 1)} t",
             f"in {job['loads']} load{'s'[: job['loads'] != 1]}",
         ),
-        ("time", said.minutes(job["time"]), ", ".join(parts)),
+        # Two in a line.
+        (
+            "time",
+            said.minutes(job["time"]),
+            ", ".join(parts[:2]) + (",\n" if parts[3:] else ", ") + ", ".join(parts[2:]),
+        ),
         ("rate", f"{said.number(job['rate'], 0)} t/h", "all of that time counted"),
         (
             "energy",
@@ -117,6 +122,13 @@ def key_figures(document: Mapping[str, Any]) -> list[tuple[str, str]]:
             unit = {"mass": " t", "time": " s", "rate": " t/h", "energy": " MJ"}[name]
             words += f"\nforeseen {shown} ± {said.half(half)}{unit}"
         found.append((value, words))
+    trucks = [truck for truck in document.get("trucks") or [] if "payload" in truck]
+    if trucks:
+        masses = [_number(truck.get("mass")) for truck in trucks]
+        least, most = (said.number(mass, 1) for mass in (min(masses), max(masses)))
+        words = f"{least} to {most} t" if least != most else f"{most} t"
+        count = f"{len(trucks)} truck{'s'[: len(trucks) > 1]}"
+        found.insert(1, (count, f"with {words}\nof {trucks[0]['payload']:g} t"))
     return found
 
 

@@ -59,7 +59,7 @@ const pile = (() => {
   const ratio = size.map((side) => 2 * side / Math.hypot(size[0], size[1]) * Math.SQRT2);
   function camera() {
     const far = Math.max(1, 1.25 * place.clientHeight / place.clientWidth);
-    const side = above ? 0.02 : 1.5, up = above ? 1.85 : 1.1;
+    const side = above ? 0.02 : 1.65, up = above ? 1.95 : 1.25;
     return { eye: { x: far * side * Math.cos(angle), y: far * side * Math.sin(angle), z: far * up },
       center: { x: 0, y: 0, z: -0.15 } };
   }

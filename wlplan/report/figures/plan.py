@@ -56,13 +56,15 @@ from wlplan.types import LoadingPlan, Pile
 _MARGIN = 0.8
 # Widths of the map of the plan and of the one beside it, gaps, room for the labels of axes, and
 # for the strip of key numbers [inch].
-_WIDE, _NARROW, _GAP, _LABELS, _STRIP = 7.4, 3.7, 0.35, 0.62, 0.75
+_WIDE, _NARROW, _GAP, _LABELS, _STRIP = 7.4, 3.7, 0.35, 0.62, 0.8
 # The least and the largest height of a map over its width, also of one of a step.
 _FLATTEST, _TALLEST = 0.85, 1.1
 _STEP = 0.6, 1.1
 # Of the approach, in the small maps of steps [m]; of more digs there the first and the last have
 # numbers.
 _LANE, _FEW = 3.5, 5
+# Width of a letter of the key figures' words [inch], and how much wider their values are.
+_LETTER, _LARGE = 0.085, 2.3
 # Height of the colour bar and of a line of the key [inch].
 _BAR, _LINE = 0.62, 0.235
 
@@ -358,10 +360,16 @@ def has_unseen(pile: Pile, view: Float[np.ndarray, "2 2"]) -> bool:
 
 
 def _write_strip(figure: Figure, figures: Sequence[tuple[str, str]]) -> None:
-    """The key figures above the maps, evenly spaced."""
+    """The key figures above the maps, each as wide as its longest line."""
     width, height = (float(side) for side in figure.get_size_inches())
-    for n, (value, words) in enumerate(figures):
-        x = (_LABELS + n * (width - _LABELS) / len(figures)) / width
-        y = 1.0 - 0.34 / height
+    lengths = [
+        max(_LARGE * len(value), *(len(line) for line in words.split("\n"))) + 3
+        for value, words in figures
+    ]
+    # Where there is room, they do not stand wider apart than it takes.
+    inch = min((width - _LABELS) / max(sum(lengths), 1), _LETTER)
+    x, y = _LABELS / width, 1.0 - 0.34 / height
+    for (value, words), length in zip(figures, lengths, strict=True):
         figure.text(x, y, value, fontsize=17, fontweight="bold", color=INK, va="bottom")
         figure.text(x, y - 0.06 / height, words, fontsize=8.5, color=FAINT, va="top")
+        x += length * inch / width
