@@ -8,12 +8,14 @@ class Page(HTMLParser):
 
     tags: list[str]
     links: list[str | None]
+    alts: list[str | None]
+    scopes: int
     text: str
 
     def __init__(self, source: str) -> None:
         super().__init__()
         self._open: list[str] = []
-        self.tags, self.links, self.text = [], [], ""
+        self.tags, self.links, self.alts, self.scopes, self.text = [], [], [], 0, ""
         self.feed(source)
         self.close()
         assert self._open == []
@@ -22,6 +24,8 @@ class Page(HTMLParser):
         """Note the tag and what it refers to."""
         self.tags.append(tag)
         self.links += [value for name, value in attrs if name in ("src", "srcset", "href")]
+        self.alts += [value for name, value in attrs if name == "alt"]
+        self.scopes += sum(name == "scope" for name, _ in attrs)
         if tag not in ("meta", "img", "br", "link", "input"):
             self._open.append(tag)
 

@@ -140,7 +140,7 @@ def fakes(
     monkeypatch.setattr(planner, "play", fake_play)
     monkeypatch.setattr(worlds, "load_world", load_world)
     if "real_figures" not in request.fixturenames:
-        for name in ("plan_figure", "totals_figure", "diggability_figure"):
+        for name in (one for one in plots.__all__ if one.endswith("_figure")):
             monkeypatch.setattr(plots, name, lambda *_, **__: Figure(figsize=(1.0, 1.0)))
 
 
@@ -607,6 +607,28 @@ def test_the_same_file_is_read_as_the_plan_was(run: Run, tmp_path: Path) -> None
     assert json.loads(out)["pile"]["cells"] == json.loads(path.read_text())["pile"]["cells"]
 
 
+def test_what_was_foreseen_keeps_its_deviation_when_it_is_played_again(
+    run: Run, scan: str, tmp_path: Path
+) -> None:
+    run("plan", scan, "--loads", 2, "--out", tmp_path / "out")
+    path = tmp_path / "out" / "plan.json"
+    document = json.loads(path.read_text())
+    assert "deviation" not in document["total"]
+    for load in document["loads"]:
+        load["deviation"] = {"mass": 0.03, "time": 0.4, "work": 5.0}
+    path.write_text(json.dumps(document))
+    code, _, _ = run("simulate", scan, path, "--out", tmp_path / "again")
+    assert code == 0
+    again = json.loads((tmp_path / "again" / "plan.json").read_text())
+    assert again["loads"][1]["deviation"] == pytest.approx(document["loads"][1]["deviation"])
+    assert again["total"]["deviation"]["time"] == pytest.approx(math.sqrt(2.0) * 0.4)
+    assert "± 0.9 s" in (tmp_path / "again" / "report.html").read_text()
+    # Half of a deviation is none.
+    del document["loads"][1]["deviation"]["time"]
+    path.write_text(json.dumps(document))
+    assert "deviation" not in json.loads(run("simulate", scan, path, "--json")[1])["total"]
+
+
 def test_a_plan_that_is_none_is_refused(run: Run, scan: str, tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
     path.write_text("{}")
@@ -630,7 +652,11 @@ def test_a_map_is_written(
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "diggability.json",
         "diggability.png",
+        "report.html",
     ]
+    page = Page((tmp_path / "out" / "report.html").read_text())
+    assert "20 places" in page.text
+    assert len(page.links) == 4
     document = strict_json((tmp_path / "out" / "diggability.json").read_text())
     assert document["action"] == {"delta_bm": 0.1, "k_bm": 2.0, "delta_bk": 0.3, "k_bk": 4.0}
     assert len(document["locations"]) == 20
@@ -967,10 +993,12 @@ def test_the_report_stands_alone_and_escapes_names(run: Run, tmp_path: Path) -> 
     assert "<b>&'x" not in source
     page = Page(source)
     assert name in page.text
-    assert len(page.links) == 2
+    # Two maps, and six charts.
+    assert len(page.links) == len(page.alts) == 8
     assert all((link or "").startswith("data:image/png;base64,") for link in page.links)
     # Ours: what is drawn, what draws, and what steers it.
     assert page.tags.count("script") == 3
+    assert len(source) < 6_000_000
 
 
 def test_progress_tells_rate_and_remaining_time(

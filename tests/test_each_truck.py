@@ -187,8 +187,8 @@ def test_a_truck_is_judged_by_the_soil_when_it_comes() -> None:
 
 
 def test_all_places_are_drawn() -> None:
-    figure = figures.plan_figure(cone(), cone(), plan(), receiver=receivers(PLACES))
-    for panel in figure.axes[:2]:
-        words = [text.get_text() for text in panel.texts]
-        assert "trucks 1, 3" in words
-        assert "truck 2" in words
+    shown = figures.PlanOnPile(cone(), plan(), receiver=receivers(PLACES))
+    figure = figures.plan_figure(shown, cone())
+    words = [text.get_text() for text in figure.axes[0].texts]
+    assert "trucks 1, 3" in words
+    assert "truck 2" in words

@@ -15,13 +15,24 @@ import pytest
 from pages import Page
 
 from wlplan.errors import InputError
+from wlplan.report.figures.key import KeyLine
 from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error, volume_lost
 from wlplan.report.page import render_report, write_report
+from wlplan.report.template import Gallery, Picture
 
 # Keys and places on the way to a value in a document.
 Way = tuple[str | int, ...]
 
-FIGURES = ((b"\x89PNG one", "The pile and the digs"), (b"\x89PNG two", "Predicted and simulated"))
+PICTURES = (Picture(b"\x89PNG one", "Ten digs"), Picture(b"\x89PNG two", "Each mass"))
+GALLERIES = (
+    Gallery(
+        "The work",
+        PICTURES[:1],
+        key=[KeyLine("arrow", "#123456", "a dig"), KeyLine("unseen", "#000000", "not seen")],
+        caption="A sentence.",
+    ),
+    Gallery("Predicted and simulated", PICTURES[1:], columns=3, small=True),
+)
 SETTINGS = {"planning, wall clock": "12 s"}
 DASH = "–"
 
@@ -69,7 +80,7 @@ HOSTILE = "</title></style>\"'><script>alert(1)</script>{{ 7 * 7 }}"
 
 
 def rendered(document: dict[str, Any]) -> Page:
-    return Page(render_report(document, figures=FIGURES, settings=SETTINGS))
+    return Page(render_report(document, galleries=GALLERIES, settings=SETTINGS))
 
 
 def places(value: Any, *way: str | int) -> Iterator[tuple[Way, Any]]:
@@ -169,7 +180,17 @@ def test_every_text_is_escaped() -> None:
             inner[way[-1]] = HOSTILE
     document["pile"][HOSTILE] = [HOSTILE]
     source = render_report(
-        document, figures=[(b"", HOSTILE), (b"", HOSTILE)], settings={HOSTILE: HOSTILE}
+        document,
+        galleries=[
+            Gallery(
+                HOSTILE,
+                [Picture(one.png, HOSTILE) for one in gallery.pictures],
+                key=[KeyLine(line.kind, HOSTILE, HOSTILE) for line in gallery.key],
+                caption=HOSTILE if gallery.caption else "",
+            )
+            for gallery in GALLERIES
+        ],
+        settings={HOSTILE: HOSTILE},
     )
     page = Page(source)
     assert "<script" not in source
@@ -189,11 +210,12 @@ def test_a_text_where_a_number_should_be_is_no_number() -> None:
 
 
 def test_the_page_loads_nothing() -> None:
-    source = render_report(DOCUMENT, figures=FIGURES, settings=SETTINGS)
+    source = render_report(DOCUMENT, galleries=GALLERIES, settings=SETTINGS)
     page = Page(source)
     assert page.links == [
-        f"data:image/png;base64,{base64.b64encode(png).decode()}" for png, _ in FIGURES
+        f"data:image/png;base64,{base64.b64encode(one.png).decode()}" for one in PICTURES
     ]
+    assert page.alts == [one.alt for one in PICTURES]
     assert not {"script", "link", "iframe", "object", "base"} & set(page.tags)
     for word in ("http:", "https:", "url(", "@import"):
         assert word not in source
@@ -218,6 +240,30 @@ def test_numbers_are_written_for_people() -> None:
     assert "−10.0\u00a0%" in text  # time, 18 for 20
 
 
+def test_what_was_foreseen_stands_beside_what_was_played_with_its_interval() -> None:
+    document = copy.deepcopy(DOCUMENT)
+    assert "±" not in rendered(document).text
+    document["total"]["deviation"] = performance(0.2, 0.5, 40.0)
+    text = " ".join(rendered(document).text.split())
+    # 1.645 deviations on either side; the time is 18 s of digging and 40 s of driving.
+    assert "foreseen 4.4 ± 0.3 t" in text
+    assert "foreseen 58 s ± 0.8 s" in text
+    assert "foreseen 2.21 ± 0.07 MJ" in text
+    assert "foreseen 0.27 ± 0.008 l" in text
+    relative = 1.645 * math.hypot(0.2 / 4.4, 0.5 / 58.0)
+    assert f"foreseen 273 ± {273.1 * relative:.0f} t/h" in text
+    assert "± is half of the interval that holds nine in ten" in text
+    del document["total"]["predicted"]
+    assert "foreseen 4.4" not in rendered(document).text
+
+
+def test_tables_have_captions_and_their_cells_have_headings() -> None:
+    page = rendered({**DOCUMENT, "notes": ["look out"]})
+    assert page.tags.count("table") == page.tags.count("caption") == 4
+    assert page.scopes == page.tags.count("th")
+    assert "Look out." in page.text
+
+
 def test_one_load_is_no_loads() -> None:
     document = changed(("loads", 1))
     assert "Loading plan: 1 load from scan.npz" in rendered(document).text
@@ -236,10 +282,10 @@ def test_a_ledger_is_closed_off_or_incomplete() -> None:
 
 
 def test_a_report_is_written_in_one_piece_or_not_at_all(tmp_path: Path) -> None:
-    path = write_report(tmp_path, DOCUMENT, figures=FIGURES, settings=SETTINGS)
+    path = write_report(tmp_path, DOCUMENT, galleries=GALLERIES, settings=SETTINGS)
     assert [path] == list(tmp_path.iterdir())
     written = path.read_text(encoding="utf-8")
-    assert written == render_report(DOCUMENT, figures=FIGURES, settings=SETTINGS)
+    assert written == render_report(DOCUMENT, galleries=GALLERIES, settings=SETTINGS)
     assert written.startswith("<!doctype html>\n")
     with pytest.raises(InputError, match="cannot be written"):
         write_report(tmp_path / "missing", DOCUMENT)

@@ -1,28 +1,27 @@
 """Figures come out for odd cases too, as valid PNG, and labels stay readable when crowded."""
 
+import dataclasses
 import itertools
 import math
 import struct
 import zlib
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.lines import Line2D
+from matplotlib.patches import FancyArrowPatch, Rectangle
 
 from wlplan.errors import InputError
 from wlplan.report import figures as plots
-from wlplan.report.figures.digs import (
-    MOST_NUMBERED,
-    _first_crossing,
-    _on_pile,
-    label_places,
-)
-from wlplan.report.figures.relief import _relief
+from wlplan.report.figures.digs import MOST_NUMBERED, number_places
+from wlplan.report.figures.plan import PlanOnPile, has_unseen, key_of
+from wlplan.report.figures.relief import _relief, shaped
+from wlplan.report.pictures import galleries_of
 from wlplan.site.receiver import Receiver
 from wlplan.studies.diggability import DiggabilityMap
 from wlplan.terrain.seed_piles import seed_pile
@@ -77,16 +76,29 @@ def drawn(figure: Figure) -> Figure:
     return figure
 
 
+def on(pile: Pile, loads: int, **more: Any) -> PlanOnPile:
+    return PlanOnPile(pile, plan_of(pile, loads), **more)
+
+
+def way_from(x: float, y: float) -> np.ndarray:
+    """Back by 4 m, and 6 m ahead and to the side."""
+    back = [[x - s, y, 0.0, -1.0] for s in range(5)]
+    return np.array([*back, *([x - 4.0 + s, y - s, 0.0, 1.0] for s in range(7))])
+
+
+def numbers_on(figure: Figure) -> list[str]:
+    return [t.get_text() for t in figure.axes[0].texts if t.get_text().isdigit()]
+
+
 @pytest.mark.parametrize("loads", [1, 3, MOST_NUMBERED])
 def test_a_plan_is_drawn(pile: Pile, loads: int) -> None:
-    figure = drawn(plots.plan_figure(pile, pile, plan_of(pile, loads)))
-    texts = [text.get_text() for text in figure.axes[0].texts]
-    assert texts == [str(n) for n in range(1, loads + 1)]
+    figure = drawn(plots.plan_figure(on(pile, loads), pile))
+    assert numbers_on(figure) == [str(n) for n in range(1, loads + 1)]
 
 
 def test_colours_say_the_order_of_many_digs(pile: Pile) -> None:
-    figure = drawn(plots.plan_figure(pile, pile, plan_of(pile, 80)))
-    assert not figure.axes[0].texts
+    figure = drawn(plots.plan_figure(on(pile, 80), pile))
+    assert numbers_on(figure) == ["1", *(str(n) for n in range(10, 81, 10))]
     (dots,) = (one for one in figure.axes[0].collections if isinstance(one, PathCollection))
     brightness = np.asarray(dots.get_facecolor())[:, :3].sum(axis=1)
     assert len(brightness) == 80
@@ -94,51 +106,143 @@ def test_colours_say_the_order_of_many_digs(pile: Pile) -> None:
     assert brightness[0] > brightness[-1] + 1.0
 
 
+def test_arrows_point_along_the_headings_and_end_at_the_digs(pile: Pile) -> None:
+    shown = on(pile, 3)
+    figure = plots.work_figure(shown)
+    figure.canvas.draw()
+    arrows = [one for one in figure.axes[0].patches if isinstance(one, FancyArrowPatch)]
+    assert len(arrows) == 3
+    for arrow, dig, heading in zip(arrows, shown.digs, shown.heading, strict=True):
+        start, end = (np.array(point) for point in arrow._posA_posB)  # type: ignore[attr-defined]
+        np.testing.assert_allclose(end, dig)
+        ahead = np.array([math.cos(heading), math.sin(heading)])
+        np.testing.assert_allclose(end - start, 5.0 * ahead, atol=1e-5)
+
+
+def test_the_legs_of_a_way_are_told_apart_by_their_lines(pile: Pile) -> None:
+    shown = on(pile, 2, receiver=receiver_at(-10.0, -3.0))
+    ways = [way_from(*dig) for dig in shown.digs]
+    kinds = [line.kind for line in key_of(shown)]
+    assert "reverse" not in kinds
+    known = dataclasses.replace(shown, ways=ways)
+    assert {"reverse", "forward"} < {line.kind for line in key_of(known)}
+    figure = drawn(plots.work_figure(known))
+    styles = [
+        one.get_linestyle()
+        for one in figure.axes[0].lines
+        if isinstance(one, Line2D) and len(np.asarray(one.get_xdata())) > 4
+    ]
+    assert styles == ["--", "-"] * 2
+
+
 def test_a_truck_is_drawn_near_and_pointed_at_far_away(pile: Pile) -> None:
     for place, words in (((-12.0, -3.0), "truck"), ((300.0, 40.0), "m")):
-        figure = drawn(
-            plots.plan_figure(pile, pile, plan_of(pile, 3), receiver=receiver_at(*place))
-        )
-        assert all(any(words in t.get_text() for t in panel.texts) for panel in figure.axes[:2])
-        width = np.ptp(figure.axes[0].get_xlim())
-        assert width < 60.0
+        shown = on(pile, 3, receiver=receiver_at(*place))
+        figure = drawn(plots.plan_figure(shown, pile))
+        assert any(words in t.get_text() for t in figure.axes[0].texts)
+        # The frame is tight.
+        sides = [
+            np.ptp(limits) for limits in (figure.axes[0].get_xlim(), figure.axes[0].get_ylim())
+        ]
+        assert min(np.array(sides) - np.ptp(shown.points, axis=0)) < 2.0
+        assert max(sides) < 30.0
 
 
-def test_unseen_cells_are_hatched(pile: Pile) -> None:
+def test_the_frame_holds_all_that_is_near(pile: Pile) -> None:
+    shown = on(pile, 3, receiver=receiver_at(-10.0, -3.0))
+    shown = dataclasses.replace(shown, ways=[way_from(*dig) for dig in shown.digs])
+    (left, right), (low, high) = (
+        plots.work_figure(shown).axes[0].get_xlim(),
+        plots.work_figure(shown).axes[0].get_ylim(),
+    )
+    parts = [*(way[:, :2] for way in shown.ways), *(truck.body for truck in shown.trucks)]
+    for part in (shown.digs, *parts):
+        assert ((part > (left, low)) & (part < (right, high))).all()
+
+
+def test_unseen_ground_is_in_the_key_where_there_is_some(pile: Pile) -> None:
     valid = np.ones(pile.height.shape, bool)
     valid[:20], valid[40:44, 50:60] = False, False
-    hatched = plots.plan_figure(pile.replace(valid=jnp.asarray(valid)), pile, plan_of(pile, 2))
-    drawn(hatched)
-    assert "not seen" in hatched.get_supxlabel()
-    assert "not seen" not in plots.plan_figure(pile, pile, plan_of(pile, 2)).get_supxlabel()
+    hatched = on(pile.replace(valid=jnp.asarray(valid)), 2)
+    drawn(plots.plan_figure(hatched, pile))
+    assert "unseen" in [line.kind for line in key_of(hatched)]
+    inside = np.array([[-3.0, -3.0], [3.0, 3.0]])
+    assert not has_unseen(pile, inside)
+    assert has_unseen(pile, 3.0 * inside)
+
+
+def test_a_wall_is_in_the_key_and_another_colour_than_soil(pile: Pile) -> None:
+    wall = np.zeros(pile.height.shape)
+    wall[-6:-3, 10:-10] = 2.5
+    walled = pile.replace(ground=jnp.asarray(wall), height=jnp.maximum(pile.height, wall))
+    words = [line.words for line in key_of(on(walled, 2))]
+    assert any("not soil" in one for one in words)
+    assert not any("not soil" in line.words for line in key_of(on(pile, 2)))
+    drawn(plots.plan_figure(on(walled, 2), walled))
+
+
+def test_the_pile_of_every_few_loads_is_drawn(pile: Pile) -> None:
+    shown = on(pile, 12)
+    few = plots.step_figure(shown, pile, slice(2, 4))
+    assert numbers_on(few) == ["3", "4"]
+    assert few.axes[0].get_title() == "Loads 3 to 4"
+    many = plots.step_figure(shown, pile, slice(0, 12))
+    assert min(size_of(plots.png_bytes(many, dpi=100))) > 200
+    assert numbers_on(many) == ["1", "12"]
+    # All have one frame, in which the numbers lie.
+    assert few.axes[0].get_xlim() == many.axes[0].get_xlim()
+
+
+def test_the_gallery_of_a_plan_says_what_is_seen(pile: Pile) -> None:
+    shown = on(pile, 5)
+    heights = np.asarray(pile.height)[None] * np.linspace(1.0, 0.9, 5)[:, None, None]
+    played = performance_of(5)
+    found = galleries_of(shown, pile.replace(height=heights[-1]), heights=heights, simulated=played)
+    assert [len(gallery.pictures) for gallery in found] == [2, 5, 6]
+    assert "before each load" in found[1].title
+    for gallery in found:
+        for picture in gallery.pictures:
+            size_of(picture.png)
+    alts = [picture.alt for gallery in found for picture in gallery.pictures]
+    assert len(set(alts)) == len(alts)
+    assert "5 digs as arrows" in alts[0]
+    assert "10 % of it is gone" in alts[1]
+    mass = np.asarray(played.mass)
+    assert alts[7] == f"Mass of each load: simulated {mass.min():.2f} to {mass.max():.2f} t."
+    assert [len(one.pictures) for one in galleries_of(shown, pile, simulated=played)] == [2, 6]
 
 
 def test_a_pile_that_runs_over_the_edge_of_the_map_is_drawn(pile: Pile) -> None:
     half = pile.replace(height=pile.height[: pile.height.shape[0] // 2])
     assert not toe_contour(half).closed
-    drawn(plots.plan_figure(half, half, plan_of(half, 5)))
+    drawn(plots.plan_figure(on(half, 5), half))
 
 
 def test_a_pile_that_is_dug_away_is_drawn(pile: Pile) -> None:
-    drawn(plots.plan_figure(pile, pile.replace(height=pile.height * 0.0), plan_of(pile, 2)))
+    gone = pile.replace(height=pile.height * 0.0)
+    drawn(plots.plan_figure(on(pile, 2), gone))
 
 
-def test_crowded_labels_do_not_overlap_nor_cover_the_pile(pile: Pile) -> None:
+def test_crowded_numbers_lie_on_their_arrows_and_never_over_each_other() -> None:
     random = np.random.default_rng(0)
     digs = np.array([3.4, 0.0]) + random.normal(0.0, 0.3, (40, 2))
     heading = math.pi + random.normal(0.0, 0.2, 40)
     radius = 0.4
-    labels = label_places(digs, heading, radius, pile)
-    apart = [np.hypot(*(a - b)) for a, b in itertools.combinations(labels, 2)]
+    places = number_places(digs, heading, radius, range(40))
+    apart = [np.hypot(*(a - b)) for a, b in itertools.combinations(places, 2)]
     assert min(apart) > 2.0 * radius
-    assert not _on_pile(labels, pile).any()
-    assert _first_crossing(digs, labels) is None
+    back = np.arctan2(*(digs - places).T[::-1])
+    np.testing.assert_allclose(np.cos(back - heading), 1.0, atol=1e-9)
+    assert len(number_places(digs, heading, radius, [0, 39])) == 2
 
 
-def test_crossing_lines_are_found() -> None:
-    starts, ends = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0, 1.0], [0.0, 1.0]])
-    assert _first_crossing(starts, ends) == (0, 1)
-    assert _first_crossing(starts, ends[::-1]) is None
+def test_a_view_grows_towards_a_place_and_no_further_than_it_has_to() -> None:
+    view = np.array([[0.0, 0.0], [10.0, 2.0]])
+    for towards, low in ((np.array([5.0, 1.0]), -1.5), (np.array([5.0, 50.0]), 0.0), (None, -1.5)):
+        grown = shaped(view, (0.5, 1.0), towards=towards)
+        np.testing.assert_allclose(np.ptp(grown, axis=0), [10.0, 5.0])
+        assert grown[0, 1] == pytest.approx(low)
+    np.testing.assert_array_equal(shaped(view, (0.1, 1.0)), view)
 
 
 def test_slopes_that_face_the_light_are_brighter() -> None:
@@ -154,6 +258,21 @@ def test_totals_are_drawn_with_and_without_a_simulation(loads: int) -> None:
     assert len(figure.axes) == 6
     assert "difference" in figure.axes[3].texts[0].get_text()
     drawn(plots.totals_figure(performance_of(loads)))
+
+
+def test_a_chart_of_one_quantity_is_the_one_of_all_of_them() -> None:
+    predicted, simulated = performance_of(15), performance_of(15, 1)
+    whole = plots.totals_figure(predicted, simulated, performance_of(15, 2))
+    for row, accumulated in enumerate((False, True)):
+        for column, name in enumerate(("mass", "time", "work")):
+            one = drawn(plots.total_figure(name, accumulated, predicted, simulated))
+            for mine, its in zip(
+                one.axes[0].lines, whole.axes[3 * row + column].lines, strict=True
+            ):
+                np.testing.assert_array_equal(mine.get_ydata(), its.get_ydata())
+    # What the ensemble does not know is a band.
+    assert len(whole.axes[0].collections) == 1
+    assert not plots.totals_figure(predicted, simulated).axes[0].collections
 
 
 def test_totals_of_empty_loads_are_drawn() -> None:
@@ -185,7 +304,5 @@ def test_figures_are_saved_in_one_piece_or_not_at_all(tmp_path: Path) -> None:
 
 
 def test_the_same_figure_gives_the_same_bytes(pile: Pile) -> None:
-    one, two = (
-        plots.png_bytes(plots.plan_figure(pile, pile, plan_of(pile, 2)), dpi=40) for _ in range(2)
-    )
+    one, two = (plots.png_bytes(plots.plan_figure(on(pile, 2), pile), dpi=40) for _ in range(2))
     assert one == two

@@ -10,7 +10,13 @@ import pytest
 from cones import cone, wide_cone
 
 from wlplan.planning.piles import heights_after
-from wlplan.report.headline import FUEL_A_MEGAJOULE, headline, trucks_said
+from wlplan.report.headline import (
+    FUEL_A_MEGAJOULE,
+    foreseen,
+    headline,
+    key_figures,
+    trucks_said,
+)
 from wlplan.report.scene import scene_of
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 
@@ -114,8 +120,9 @@ def test_loads_go_to_their_truck_and_are_said_in_the_coordinates_of_the_scan() -
     assert scene["loads"][0]["path"] == []
     low, high = np.array(scene["view"])
     for truck in scene["trucks"]:
-        assert (np.array(truck["corners"]) > low).all()
-        assert (np.array(truck["corners"]) < high).all()
+        for part in (truck["bed"], truck["cab"]):
+            assert (np.array(part) > low).all()
+            assert (np.array(part) < high).all()
 
 
 def test_the_headline_adds_up() -> None:
@@ -132,6 +139,38 @@ def test_the_headline_adds_up() -> None:
     assert found["fuel"] == pytest.approx(8.0 * FUEL_A_MEGAJOULE)
     assert 9.0 < found["fuel"] * 10.0 < 20.0
     assert np.isnan(headline({})["mass"])
+
+
+def test_what_was_foreseen_drives_and_dumps_as_long() -> None:
+    total = {
+        "simulated": {"mass": 40.0, "time": 100.0, "work": 5000.0},
+        "predicted": {"mass": 44.0, "time": 90.0, "work": 4000.0},
+        "transport": {"time": 200.0, "work": 3000.0, "wait": 60.0},
+    }
+    found = foreseen({"loads": [{}] * 10, "total": total})
+    assert found["time"][0] == 350.0
+    assert found["energy"][0] == pytest.approx(7.0)
+    assert all(np.isnan(half) for _, half in found.values())
+    exact = {**total, "deviation": {"mass": 0.0, "time": 0.0, "work": 0.0}}
+    assert all(half == 0.0 for _, half in foreseen({"total": exact}).values())
+    assert foreseen({}) == {}
+    played = {name: total[name] for name in ("simulated", "transport")}
+    assert foreseen({"total": played}) == {}
+
+
+def test_the_key_figures_of_a_picture_are_those_of_the_page() -> None:
+    total = {
+        **{"simulated": {"mass": 40.0, "time": 100.0, "work": 5000.0}},
+        **{"predicted": {"mass": 44.0, "time": 90.0, "work": 4000.0}},
+        **{"transport": {"time": 200.0, "work": 3000.0}},
+        **{"deviation": {"mass": 1.0, "time": 1.0, "work": 100.0}},
+    }
+    found = dict(key_figures({"loads": [{}] * 10, "total": total}))
+    assert found["40.0 t"] == "in 10 loads\nforeseen 44.0 ± 2 t"
+    assert "waiting" not in found["5\u00a0min 00\u00a0s"]
+    assert key_figures({"loads": [{}], "total": {}})[0] == ("– t", "in 1 load")
+    trucks = [{"payload": 18.0, "mass": mass} for mass in (17.9, 18.2)]
+    assert key_figures({"trucks": trucks})[1] == ("2 trucks", "with 17.9 to 18.2 t\nof 18 t")
 
 
 def test_trucks_are_said_with_payload_and_last_bucket() -> None:

@@ -17,6 +17,9 @@ CELL_SIZE = 0.1
 # Dumping [s]. Follow-up: 5 s, without work.
 DUMP_TIME = 5.0
 
+PERCENT_90 = 1.6449
+"""Standard deviations on either side that hold 90 % of a normal distribution."""
+
 # Box of the action parameters, in the order of `Action`. Paper, section 6.2.
 ACTION_LOW = (0.0, 0.0, 0.0, 0.0)
 ACTION_HIGH = (0.7, 5.0, 0.7, 5.0)

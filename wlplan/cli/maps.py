@@ -28,6 +28,7 @@ from wlplan.cli.outputs import (
     checked_folder,
     json_text,
     print_table,
+    remark,
     titled_table,
     write_files,
 )
@@ -79,7 +80,9 @@ def diggability(
 ) -> None:
     """Map what one action would yield all around PILE.
 
-    With --out: diggability.png and diggability.json. Nothing is random, so --seed changes nothing.
+    With --out: report.html, which shows everything, diggability.png and diggability.json.
+
+    Nothing is random, so --seed changes nothing.
     """
     check_pile_name(pile_file.name)
     check_models(model, pile_state, world_name)
@@ -88,7 +91,9 @@ def diggability(
 
     import numpy as np
 
-    from wlplan.studies.diggability import diggability_map
+    from wlplan.report.plausibility import remarks_on_map
+    from wlplan.site.site import Site
+    from wlplan.studies.diggability import diggability_map, stalls_on_map
     from wlplan.types import Action
 
     named = pile_named(pile_file, site.machine)
@@ -101,6 +106,7 @@ def diggability(
             diggability_map(world, pile, locations=locations, action=fixed, contour=named.contour)
         )
 
+        stalls = ready(stalls_on_map(world, pile, found, fixed))
     records = {
         name: np.asarray(getattr(part, name), np.float64)
         for part in (found.pose, found.performance)
@@ -128,12 +134,28 @@ def diggability(
             {name: float(values[n]) for name, values in records.items()} for n in range(locations)
         ],
     }
+    if stalls is not None:
+        for place, likely in zip(document["locations"], np.asarray(stalls), strict=True):
+            place["stall_probability"] = float(likely)
+    document["notes"] = remarks_on_map(
+        document,
+        pile,
+        Site(machine=site.machine, soil=site.soil),
+        models=hasattr(world, "faces_seen"),
+    )
     text = json_text(document)
     if folder is not None:
         from wlplan.report import figures as plots
+        from wlplan.report.diggability_page import REPORT_NAME, render_map
 
         png = plots.png_bytes(plots.diggability_figure(pile, found, frame=named.frame))
-        write_files(folder, {"diggability.png": png, "diggability.json": f"{text}\n"})
+        page = render_map(document, pile, settings={"map, wall clock": mapping.text()})
+        write_files(
+            folder,
+            {REPORT_NAME: page, "diggability.png": png, "diggability.json": f"{text}\n"},
+        )
+    for note in document["notes"]:
+        remark(note)
     if as_json:
         click.echo(text)
         return
@@ -151,4 +173,4 @@ def diggability(
     print_table(table)
     print(f"map {mapping.text()}")
     if folder is not None:
-        print(f"written: {folder / 'diggability.png'}, and diggability.json beside it")
+        print(f"written: {folder / REPORT_NAME}, and diggability.png, diggability.json beside it")

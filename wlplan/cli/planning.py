@@ -240,7 +240,7 @@ def simulate(
     from wlplan.planning.amounts import amount_recorded
     from wlplan.planning.piles import heights_after
     from wlplan.planning.plan import play
-    from wlplan.report.document import plan_document, write_plan_folder
+    from wlplan.report.document import deviation_of, plan_document, write_plan_folder
     from wlplan.site.frame import frame_recorded
 
     loading_plan, given = read_plan(plan_file)
@@ -308,6 +308,7 @@ def simulate(
         site=place,
         predicted=predicted,
         predicted_cost=None if predicted is None else _predicted_cost(given),
+        deviation=None if predicted is None else deviation_of(given),
         stall_probability=_stalls_foreseen(given),
         amount=amount,
         pile=named.fields,

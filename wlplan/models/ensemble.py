@@ -17,11 +17,10 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
+# Here it is looked for; who only prints takes it from there, without JAX.
+from wlplan.constants import PERCENT_90 as PERCENT_90
 from wlplan.models.performance import PerformanceModel
 from wlplan.types import Characteristics, LocalHeightmap, Performance
-
-PERCENT_90 = 1.6449
-"""Standard deviations on either side that hold 90 % of a normal distribution."""
 
 
 @no_type_check

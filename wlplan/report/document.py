@@ -20,6 +20,7 @@ from wlplan.planning.placement import place_of
 from wlplan.planning.playing import PlanResult
 from wlplan.planning.way import points_of
 from wlplan.planning.yard import unpacked_soil
+from wlplan.report.legs import way
 from wlplan.report.plausibility import remarks_on
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
@@ -185,6 +186,21 @@ def paths_of(before: Pile, played: PlanResult, site: Site) -> list[dict[str, Any
     return found
 
 
+def deviation_of(document: Mapping[str, Any]) -> Performance | None:
+    """The standard deviations that a plan.json has for all of its loads; None if it lacks one."""
+    records = [load.get("deviation") for load in document["loads"]]
+    rows = [
+        [record.get(name) if isinstance(record, dict) else None for name in QUANTITIES]
+        for record in records
+    ]
+    known = all(
+        isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and v >= 0.0
+        for row in rows
+        for v in row
+    )
+    return Performance(*np.array(rows, dtype=float).T) if rows and known else None
+
+
 def totals(performance: Performance, cost: float | None = None) -> dict[str, float]:
     """Sums of mass [tonne], time [s] and work [kJ] over the loads, and the cost if there is one."""
     sums = {quantity: _sum(getattr(performance, quantity)) for quantity in QUANTITIES}
@@ -266,24 +282,28 @@ def write_plan_folder(
     from wlplan.io import write_bytes_atomic, write_plan
     from wlplan.report import figures
     from wlplan.report.exports import Played, exported
+    from wlplan.report.headline import key_figures
     from wlplan.report.page import REPORT_NAME, write_report
+    from wlplan.report.pictures import galleries_of
     from wlplan.report.scene import scene_of
 
-    count = len(document["loads"])
-    performance = simulated.rollout.performance
-    map_png = figures.png_bytes(
-        figures.plan_figure(
-            pile,
-            simulated.rollout.pile,
-            simulated.plan,
-            receiver=site.placed_receiver,
-            ways=[np.array(load["path"]["points"]) for load in document["loads"] if "path" in load],
-            area=site.truck_area,
-            frame=site.frame,
-            after_title=f"After {count} load{'s' if count > 1 else ''} in the simulator",
-        )
+    count, after = len(document["loads"]), simulated.rollout.pile
+    performance, deviation = simulated.rollout.performance, deviation_of(document)
+    played_in = "discrete elements" if document.get("engine") == "dem" else "the simulator"
+    shown = figures.PlanOnPile(
+        pile,
+        simulated.plan,
+        receiver=site.placed_receiver,
+        ways=[way(load) for load in document["loads"]],
+        area=site.truck_area,
+        frame=site.frame,
+        machine=site.machine,
     )
-    both = (performance, None) if predicted is None else (predicted, performance)
+    title = f"After {count} load{'s'[: count != 1]} in {played_in}"
+    map_png = figures.png_bytes(
+        figures.plan_figure(shown, after, after_title=title, figures=key_figures(document))
+    )
+    both = (performance, None) if predicted is None else (predicted, performance, deviation)
     totals_png = figures.png_bytes(figures.totals_figure(*both))
     write_plan(folder / "plan.json", document)
     write_bytes_atomic(folder / "plan.png", map_png)
@@ -291,9 +311,14 @@ def write_plan_folder(
     write_report(
         folder,
         document,
-        figures=(
-            (map_png, "The pile and the digs"),
-            (totals_png, "Predicted beside simulated" if predicted is not None else "Simulated"),
+        galleries=galleries_of(
+            shown,
+            after,
+            after_title=title,
+            heights=heights,
+            predicted=predicted,
+            simulated=performance,
+            deviation=deviation,
         ),
         scene=None if heights is None else scene_of(pile, heights, document),
         settings=settings,

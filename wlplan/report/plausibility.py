@@ -69,6 +69,55 @@ def remarks_on(
     ]
 
 
+def remarks_on_map(
+    document: Mapping[str, Any], pile: Pile, site: Site, *, models: bool = False
+) -> list[str]:
+    """What is worth knowing of a diggability map, sentences without their stops.
+
+    Args:
+        document: Content of its diggability.json.
+        pile: That is mapped.
+        site: Machine and soil.
+        models: Whether models predicted, which know level floors alone.
+    """
+    places = document["locations"]
+    masses = np.array([place["mass"] for place in places])
+    little = masses < _NEXT_TO_NOTHING * max(float(np.median(masses)), 1.0)
+    likely = np.array([place.get("stall_probability", 0.0) for place in places])
+    found = []
+    if little.any():
+        found.append(f"{_places(little)} next to nothing: {masses.min():.1f} t at the least")
+    if (likely > _MAY_STALL).any():
+        found.append(
+            f"{_places(likely > _MAY_STALL, 'is', 'are')} at the edge of a stall, with a "
+            f"probability of up to {100.0 * likely.max():.0f} %"
+        )
+    off = _off_level(places, pile, site) if models else np.zeros(0)
+    if (off > _UNEVEN).any():
+        found.append(
+            f"the floor at {_places(off > _UNEVEN, 'is', 'is')} not level, off by up to "
+            f"{off.max():.1f} m: the models know level floors alone"
+        )
+    unseen = np.array([not _was_seen(place, pile) for place in places])
+    if unseen.any():
+        found.append(f"{_places(unseen, 'lies', 'lie')} where the scan saw nothing: it is a guess")
+    return [*found, *_steep(pile, site)]
+
+
+def _places(which: np.ndarray, one: str = "yields", more: str = "yield") -> str:
+    """Places by how many they are, and a verb."""
+    count = int(which.sum())
+    return f"{count} of {len(which)} places {one if count == 1 else more}"
+
+
+def _was_seen(place: Mapping[str, Any], pile: Pile) -> bool:
+    if pile.valid is None:
+        return True
+    at = (np.array([place["x"], place["y"]]) - np.asarray(pile.origin, float)) / pile.cell_size
+    i, j = np.clip(np.rint(at).astype(int), 0, np.array(pile.height.shape) - 1)
+    return bool(np.asarray(pile.valid)[i, j])
+
+
 def _stopped(document: Mapping[str, Any]) -> list[str]:
     by = {"budget": "by its budget", "interrupted": "by hand"}.get(document.get("stopped", ""))
     return [] if by is None else [f"the search was ended early, {by}: this is the best by then"]
@@ -150,6 +199,19 @@ def _new_faces(
 
 def _uneven_floor(loads: Sequence[Mapping[str, Any]], pile: Pile, site: Site) -> list[str]:
     """The models know level floors alone: of another they see nothing."""
+    worst = _off_level(loads, pile, site)
+    uneven = np.flatnonzero(worst > _UNEVEN)
+    if not len(uneven):
+        return []
+    return [
+        f"the floor ahead of {_loads(uneven, 'is', 'is')} not level, off by up to "
+        f"{worst.max():.1f} m: the models know level floors alone and do not foresee a stall "
+        f"there; go by what was played"
+    ]
+
+
+def _off_level(loads: Sequence[Mapping[str, Any]], pile: Pile, site: Site) -> np.ndarray:
+    """How far the floor that each bucket goes over is off that where it goes in [m]."""
     x, y, heading = (
         np.array([[load.get(name, np.nan)] for load in loads]) for name in ("x", "y", "heading")
     )
@@ -162,20 +224,13 @@ def _uneven_floor(loads: Sequence[Mapping[str, Any]], pile: Pile, site: Site) ->
     cells = (places - np.asarray(pile.origin, float)[:, None, None]) / pile.cell_size
     floor = np.asarray(pile.floor)
     if not np.isfinite(cells).all():
-        return []
+        return np.zeros(len(loads))
     most = np.array(floor.shape)[:, None, None] - 1
     i, j = np.clip(np.rint(cells).astype(int), 0, most)
     # Structures are not meant.
     off = np.abs(floor[i, j] - floor[i[:, :1], j[:, :1]])
-    worst = np.where(standing(floor, pile.cell_size)[i, j], 0.0, off).max(axis=1)
-    uneven = np.flatnonzero(worst > _UNEVEN)
-    if not len(uneven):
-        return []
-    return [
-        f"the floor ahead of {_loads(uneven, 'is', 'is')} not level, off by up to "
-        f"{worst.max():.1f} m: the models know level floors alone and do not foresee a stall "
-        f"there; go by what was played"
-    ]
+    worst: np.ndarray = np.where(standing(floor, pile.cell_size)[i, j], 0.0, off).max(axis=1)
+    return worst
 
 
 def _tight(loads: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -13,6 +13,9 @@ from jaxtyping import Float, Int
 
 from wlplan.report.figures.relief import view_of
 from wlplan.report.figures.truck import Truck
+from wlplan.report.legs import approach, approach_distance, way
+from wlplan.site.frame import frame_recorded
+from wlplan.site.machine import WA320
 from wlplan.site.receiver import Receiver
 from wlplan.types import Pile
 
@@ -20,8 +23,8 @@ from wlplan.types import Pile
 _CELLS = 200
 # Heights are kept in whole parts of this [m].
 _STEP = 0.005
-# Lines lie so far above the ground [m]; trucks are so high.
-_ABOVE, _TRUCK_HEIGHT = 0.15, 2.8
+# Lines lie so far above the ground, and go so far into the pile [m].
+_ABOVE, _IN = 0.15, 0.8
 
 
 def scene_of(
@@ -42,44 +45,70 @@ def scene_of(
     digs = np.array([[load["x"], load["y"]] for load in loads], float).reshape(-1, 2)
     trucks = _trucks(document)
     seen = [digs, *(truck.body for truck in trucks)]
-    seen += [_points(load)[:, :2] for load in loads if "path" in load]
+    seen += [way(load)[:, :2] for load in loads]
     points = np.concatenate(seen)
-    rows, columns, every = _window(before, points)
     all_heights = np.concatenate([np.asarray(before.height)[None], heights]).astype(np.float64)
-    shown = all_heights[:, rows, columns][:, ::every, ::every]
-    lowest = float(shown.min())
-    whole = np.rint((shown - lowest) / _STEP).astype(np.int64)
-    floor = np.asarray(before.floor, np.float64)[rows, columns][::every, ::every]
-    corner = np.asarray(before.origin, np.float64)
-    offset = (document.get("frame") or {}).get("offset", [0.0, 0.0, 0.0])
-    size = before.cell_size
+    # It is looked at from the side of the trucks.
+    side = np.mean([truck.body.mean(axis=0) for truck in trucks] or digs, axis=0)
+    ground, whole = ground_of(before, all_heights, points, side, document)
+    distance = approach_distance(document)
     return {
-        "x": [round(float(corner[0] + size * i), 3) for i in range(rows.start, rows.stop, every)],
-        "y": [
-            round(float(corner[1] + size * j), 3) for j in range(columns.start, columns.stop, every)
-        ],
-        "view": np.round(view_of(before, points), 2).tolist(),
-        # It is looked at from the side of the trucks.
-        "side": np.round(
-            np.mean([t.body.mean(axis=0) for t in trucks] or digs, axis=0), 2
-        ).tolist(),
-        "offset": [float(value) for value in offset],
-        "step": _STEP,
-        "lowest": lowest,
-        "heights": _packed(whole[0]),
-        "floor": _packed(np.rint((floor - lowest) / _STEP).astype(np.int64)),
+        **ground,
         "changes": [_change(old, new) for old, new in itertools.pairwise(whole)],
+        "loader": {"length": WA320.length, "width": WA320.bucket_width},
         "loads": [
             {
-                "dig": _dig(load, before, all_heights[n]),
+                "dig": _dig(load, distance, before, all_heights[n]),
                 "path": _path(load, before, all_heights[n]),
                 "truck": _truck_of(document, n),
             }
             for n, load in enumerate(loads)
         ],
-        "said": [_said(load, offset) for load in loads],
+        "said": [_said(load, ground["offset"]) for load in loads],
         "trucks": [_box(truck, before, all_heights[0]) for truck in trucks],
     }
+
+
+def ground_of(
+    pile: Pile,
+    heights: Float[np.ndarray, "n nx ny"],
+    points: Float[np.ndarray, "m 2"],
+    side: Float[np.ndarray, "2"],
+    document: Mapping[str, Any],
+) -> tuple[dict[str, Any], Int[np.ndarray, "n a b"]]:
+    """The ground that a page shows, and heights on it in whole steps.
+
+    Args:
+        pile: Whose grid and floor it is.
+        heights: Of the pile, one or several [m]; the page has the first.
+        points: What is to be seen beside the pile [m].
+        side: From where it is looked at [m].
+        document: With its frame.
+    """
+    rows, columns, every = _window(pile, points)
+    shown = np.asarray(heights, np.float64)[:, rows, columns][:, ::every, ::every]
+    lowest = float(shown.min())
+    whole = np.rint((shown - lowest) / _STEP).astype(np.int64)
+    floor = np.asarray(pile.floor, np.float64)[rows, columns][::every, ::every]
+    corner, size = np.asarray(pile.origin, np.float64), pile.cell_size
+
+    def along(axis: int, cells: slice) -> list[float]:
+        places = corner[axis] + size * np.arange(cells.start, cells.stop, every)
+        rounded: list[float] = np.round(places, 3).tolist()
+        return rounded
+
+    ground = {
+        "x": along(0, rows),
+        "y": along(1, columns),
+        "view": np.round(view_of(pile, points), 2).tolist(),
+        "side": np.round(side, 2).tolist(),
+        "offset": list(frame_recorded(document).offset),
+        "step": _STEP,
+        "lowest": lowest,
+        "heights": _packed(whole[0]),
+        "floor": _packed(np.rint((floor - lowest) / _STEP).astype(np.int64)),
+    }
+    return ground, whole
 
 
 def _window(pile: Pile, points: Float[np.ndarray, "n 2"]) -> tuple[slice, slice, int]:
@@ -108,7 +137,7 @@ def _change(old: Int[np.ndarray, "a b"], new: Int[np.ndarray, "a b"]) -> dict[st
     return {"at": [i, j], "size": list(part.shape), "heights": _packed(part)}
 
 
-def _height_at(
+def height_at(
     points: Float[np.ndarray, "n 2"], pile: Pile, height: Float[np.ndarray, "nx ny"]
 ) -> Float[np.ndarray, " n"]:
     """Of the nearest cells; beyond the map that of its edge [m]."""
@@ -118,18 +147,12 @@ def _height_at(
     return found
 
 
-def _points(load: Mapping[str, Any]) -> Float[np.ndarray, "n 4"]:
-    return np.array(load["path"]["points"], float).reshape(-1, 4)
-
-
 def _path(
     load: Mapping[str, Any], pile: Pile, height: Float[np.ndarray, "nx ny"]
 ) -> list[list[float]]:
     """x, y, z and gear along the way to the truck [m]; nothing if it is not known."""
-    if "path" not in load:
-        return []
-    points = _points(load)[::2]
-    z = _height_at(points[:, :2], pile, height) + _ABOVE
+    points = way(load)[::2]
+    z = height_at(points[:, :2], pile, height) + _ABOVE
     return [
         [round(x, 2), round(y, 2), round(float(up), 2), float(gear)]
         for (x, y, _, gear), up in zip(points.tolist(), z, strict=True)
@@ -137,13 +160,12 @@ def _path(
 
 
 def _dig(
-    load: Mapping[str, Any], pile: Pile, height: Float[np.ndarray, "nx ny"]
+    load: Mapping[str, Any], distance: float, pile: Pile, height: Float[np.ndarray, "nx ny"]
 ) -> list[list[float]]:
     """The approach: from where the loader waits to where the bucket goes in, x, y, z [m]."""
-    ahead = np.array([math.cos(load["heading"]), math.sin(load["heading"])])
-    tip = np.array([load["x"], load["y"]], float)
-    points = np.stack([tip - 5.0 * ahead, tip, tip + 0.8 * ahead])
-    z = _height_at(points, pile, height) + _ABOVE
+    start, tip = approach(load, distance)
+    points = np.stack([start, tip, tip + _IN * (tip - start) / distance])
+    z = height_at(points, pile, height) + _ABOVE
     found: list[list[float]] = np.round(np.column_stack([points, z]), 2).tolist()
     return found
 
@@ -180,13 +202,10 @@ def _truck_of(document: Mapping[str, Any], load: int) -> int:
     return 0
 
 
-def _box(
-    truck: Truck, pile: Pile, height: Float[np.ndarray, "nx ny"]
-) -> dict[str, Sequence[Any] | float]:
-    """The four corners of a truck [m], the ground there, and how high it is."""
-    corners = truck.body
+def _box(truck: Truck, pile: Pile, height: Float[np.ndarray, "nx ny"]) -> dict[str, Any]:
+    """The corners of bed and cab of a truck, and the ground there [m]."""
     return {
-        "corners": np.round(corners, 2).tolist(),
-        "ground": round(float(np.median(_height_at(corners, pile, height))), 2),
-        "height": _TRUCK_HEIGHT,
+        "bed": np.round(truck.bed, 2).tolist(),
+        "cab": np.round(truck.cab, 2).tolist(),
+        "ground": round(float(np.median(height_at(truck.body, pile, height))), 2),
     }

@@ -7,11 +7,12 @@ from typing import no_type_check
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import Array, Float
 
 from wlplan.checks import check_action, check_pile, check_world
 from wlplan.terrain.toe import ToeContour, edge_poses, toe_contour
 from wlplan.types import Action, Performance, Pile, Pose, PyTree, World
-from wlplan.worlds.capabilities import as_pytree, foresee
+from wlplan.worlds.capabilities import as_pytree, can, foresee
 
 # The action of the paper's diggability map. Paper, section 7.4.
 PAPER_ACTION = Action(0.68, 4.51, 0.17, 4.46)
@@ -57,6 +58,31 @@ def diggability_map(
     pose = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), pose)
     action = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), action)
     return DiggabilityMap(pose, _predict(as_pytree(world), pile, pose, action))
+
+
+def stalls_on_map(
+    world: World, pile: Pile, found: DiggabilityMap, action: Action = PAPER_ACTION
+) -> Float[Array, " n"] | None:
+    """How likely each location of a map stalls; None if the world does not know.
+
+    Args:
+        world: That predicted the map.
+        pile: That it is of.
+        found: The map.
+        action: At every location.
+    """
+    if not can(world, "stall_probability"):
+        return None
+    likely: Array = _stalls(as_pytree(world), pile, found.pose, action)
+    return likely
+
+
+@jax.jit
+def _stalls(world: PyTree, pile: Pile, pose: Pose, action: Action) -> Array:
+    dtype = pile.height.dtype
+    action = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), action)
+    found: Array = jax.vmap(lambda one: world.stall_probability(pile, one, action))(pose)
+    return found
 
 
 @jax.jit

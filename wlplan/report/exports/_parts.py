@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -10,12 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from wlplan.report.figures.truck import Truck
+from wlplan.report.legs import approach, approach_distance, way
+from wlplan.report.legs import legs as legs_of
 from wlplan.report.stands import stands_of
 from wlplan.site.frame import frame_recorded
 from wlplan.site.receiver import Receiver
-
-# From where the loader waits to where the bucket goes in [m].
-_APPROACH = 5.0
 
 
 def _shifted(points: Float[np.ndarray, "n 2"], document: Mapping[str, Any]) -> np.ndarray:
@@ -25,20 +23,16 @@ def _shifted(points: Float[np.ndarray, "n 2"], document: Mapping[str, Any]) -> n
 
 def digs(document: Mapping[str, Any]) -> Iterator[tuple[int, Mapping[str, Any], np.ndarray]]:
     """Number, record and approach of each load: two points, the second where it digs [m]."""
+    distance = approach_distance(document)
     for number, load in enumerate(document["loads"], start=1):
-        ahead = np.array([math.cos(load["heading"]), math.sin(load["heading"])])
-        tip = np.array([load["x"], load["y"]], float)
-        yield number, load, _shifted(np.stack([tip - _APPROACH * ahead, tip]), document)
+        yield number, load, _shifted(approach(load, distance), document)
 
 
 def legs(document: Mapping[str, Any]) -> Iterator[tuple[int, str, np.ndarray]]:
     """Number of the load, "reverse" or "forward", and points of each leg of its way [m]."""
     for number, load in enumerate(document["loads"], start=1):
-        points = np.array(load.get("path", {}).get("points", []), float).reshape(-1, 4)
-        for gear, name in ((-1.0, "reverse"), (1.0, "forward")):
-            leg = points[points[:, 3] == gear, :2]
-            if len(leg) > 1:
-                yield number, name, _shifted(leg, document)
+        for name, leg in legs_of(way(load)).items():
+            yield number, name, _shifted(leg, document)
 
 
 def trucks(document: Mapping[str, Any]) -> Iterator[tuple[str, np.ndarray]]:

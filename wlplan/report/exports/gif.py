@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import math
-from typing import Any
 
 import numpy as np
 from matplotlib.colors import Normalize
 from PIL import Image
 
 from wlplan.report.exports import Played
+from wlplan.report.figures.digs import order_colours
 from wlplan.report.figures.relief import (
     PILE,
     draw_pile,
@@ -19,9 +19,10 @@ from wlplan.report.figures.relief import (
     height_above_ground,
     view_of,
 )
-from wlplan.report.figures.style import BLUE, add_arrow, frame_map, map_panels
+from wlplan.report.figures.style import add_arrow, frame_map, map_panels
 from wlplan.report.figures.truck import Truck, draw_truck
 from wlplan.report.figures.ways import draw_ways
+from wlplan.report.legs import approach, approach_distance, way
 from wlplan.report.stands import stands_of
 from wlplan.site.frame import frame_recorded
 from wlplan.site.receiver import Receiver
@@ -30,8 +31,6 @@ LIBRARY: str | None = None
 NAME = "plan.gif"
 # Pictures at most, how long each is shown [ms], and pixels an inch.
 _MOST, _SHOWN, _DPI = 60, 700, 80
-# From where the loader waits to where the bucket goes in [m].
-_APPROACH = 5.0
 
 
 def content(played: Played) -> bytes:
@@ -44,8 +43,7 @@ def content(played: Played) -> bytes:
         Truck(Receiver(stand["x"], stand["y"], stand["heading"]), name)
         for name, stand in stands_of(played.document)
     ]
-    ways = [np.array(load["path"]["points"], float) for load in loads if "path" in load]
-    points = [digs, *(truck.body for truck in trucks), *(way[:, :2] for way in ways)]
+    points = [digs, *(truck.body for truck in trucks), *(way(load)[:, :2] for load in loads)]
     view = grow_to_ratio(view_of(played.before, np.concatenate(points)))
     norm = Normalize(0.0, max(float(height_above_ground(played.before).max()), 0.1))
     pictures = [_picture(played, n, view, norm, trucks) for n in shown]
@@ -72,16 +70,11 @@ def _picture(
     for truck in trucks:
         draw_truck(panel, truck, view)
     if n < len(loads):
-        _draw_load(panel, loads[n])
+        colours = order_colours(len(loads))[n : n + 1]
+        draw_ways(panel, [way(loads[n])], colours)
+        lane = approach(loads[n], approach_distance(played.document))
+        add_arrow(panel, *lane, colour=colours[0], line=2.0, head=12.0, zorder=8)
     buffer = io.BytesIO()
     # All pictures have to be of one size.
     figure.savefig(buffer, format="png", dpi=_DPI)
     return Image.open(buffer).convert("RGB").quantize(128, dither=Image.Dither.NONE)
-
-
-def _draw_load(panel: Any, load: dict[str, Any]) -> None:
-    if "path" in load:
-        draw_ways(panel, [np.array(load["path"]["points"], float)])
-    ahead = np.array([math.cos(load["heading"]), math.sin(load["heading"])])
-    tip = np.array([load["x"], load["y"]], float)
-    add_arrow(panel, tip - _APPROACH * ahead, tip, colour=BLUE, line=2.0, head=12.0, zorder=8)

@@ -6,9 +6,28 @@ the north-west. What figures share: `style` for colours and axes, `relief` for t
 `digs` and `truck` for what lies on it, `png` for files.
 """
 
-from wlplan.report.figures.diggability import diggability_figure
-from wlplan.report.figures.plan import plan_figure
+from wlplan.report.figures.diggability import Shade, diggability_figure, shade_figure
+from wlplan.report.figures.plan import (
+    PlanOnPile,
+    left_figure,
+    plan_figure,
+    step_figure,
+    work_figure,
+)
 from wlplan.report.figures.png import png_bytes, save_figure
-from wlplan.report.figures.totals import totals_figure
+from wlplan.report.figures.totals import total_figure, totals_figure
 
-__all__ = ["diggability_figure", "plan_figure", "png_bytes", "save_figure", "totals_figure"]
+__all__ = [
+    "PlanOnPile",
+    "Shade",
+    "diggability_figure",
+    "left_figure",
+    "plan_figure",
+    "png_bytes",
+    "save_figure",
+    "shade_figure",
+    "step_figure",
+    "total_figure",
+    "totals_figure",
+    "work_figure",
+]

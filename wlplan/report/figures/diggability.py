@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +15,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
 from wlplan.constants import QUANTITIES
+from wlplan.report.figures.orientation import draw_orientation
 from wlplan.report.figures.relief import (
     STONE,
     draw_pile,
@@ -21,15 +24,52 @@ from wlplan.report.figures.relief import (
     view_of,
 )
 from wlplan.report.figures.style import FAINT, INK, frame_map, new_figure, tidy
+from wlplan.report.legs import approaches
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.studies.diggability import DiggabilityMap
-from wlplan.types import Pile
+from wlplan.types import Pile, Pose
 
 # Yellow is good in every map: much mass, little time and work.
 _MUCH_IS_GOOD, _LITTLE_IS_GOOD = colormaps["viridis"], colormaps["viridis_r"]
 # Length of the line that marks a location [m]; at most this part of the view.
 _TICK = 1.5
 _TICK_PART = 0.09
+# Width of one map, and height of the histogram below it [inch].
+_MAP, _HISTOGRAM = 12.0 / 3.3, 1.6
+
+
+@dataclasses.dataclass(frozen=True)
+class Shade:
+    """One quantity of all locations.
+
+    Attributes:
+        title: Its name, in the middle of a sentence.
+        unit: Of the values.
+        digits: After the point, in tables.
+        values: Of each location.
+        much_is_good: Or little.
+    """
+
+    title: str
+    unit: str
+    digits: int
+    values: Float[np.ndarray, " n"]
+    much_is_good: bool
+
+    @property
+    def median(self) -> float:
+        """Of the values."""
+        return float(np.median(self.values))
+
+    @property
+    def best(self) -> int:
+        """Which location is best."""
+        return int(self.values.argmax() if self.much_is_good else self.values.argmin())
+
+    @property
+    def colours(self) -> Colormap:
+        """Yellow is good."""
+        return _MUCH_IS_GOOD if self.much_is_good else _LITTLE_IS_GOOD
 
 
 def diggability_figure(pile: Pile, diggability: DiggabilityMap, *, frame: Frame = LOCAL) -> Figure:
@@ -43,38 +83,63 @@ def diggability_figure(pile: Pile, diggability: DiggabilityMap, *, frame: Frame 
         diggability: Poses and performance, leaves [n].
         frame: What the coordinates on the axes are in.
     """
-    pose = diggability.pose
+    shades = [
+        Shade(
+            f"{'load' if name == 'mass' else 'loading'} {title}",
+            unit,
+            digits,
+            np.asarray(getattr(diggability.performance, name), float),
+            name == "mass",
+        )
+        for name, (title, unit, digits) in QUANTITIES.items()
+    ]
+    return _maps(pile, diggability.pose, shades, frame)
+
+
+def shade_figure(pile: Pile, pose: Pose, shade: Shade, *, frame: Frame = LOCAL) -> Figure:
+    """One map with its histogram, as in `diggability_figure`.
+
+    Args:
+        pile: The pile the map was made for.
+        pose: The locations, leaves [n].
+        shade: What their colours say.
+        frame: What the coordinates on the axes are in.
+    """
+    return _maps(pile, pose, [shade], frame)
+
+
+def _maps(pile: Pile, pose: Pose, shades: Sequence[Shade], frame: Frame) -> Figure:
     digs = np.stack([np.asarray(pose.x), np.asarray(pose.y)], axis=-1).astype(float)
     heading = np.asarray(pose.heading, float)
     inward = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     view = grow_to_ratio(view_of(pile, digs - _TICK * inward))
     tick = min(_TICK, _TICK_PART * float(np.ptp(view, axis=0).max()))
-    ticks = np.stack([digs - tick * inward, digs], axis=1)
+    ticks = approaches(digs, heading, tick)
 
-    ratio = float(np.divide(*np.ptp(view, axis=0)[::-1]))
-    figure = new_figure(12.0, 12.0 / 3.3 * ratio + 2.7)
-    panels = figure.subplots(2, 3, height_ratios=[12.0 / 3.3 * ratio, 1.6])
+    tall = _MAP * float(np.divide(*np.ptp(view, axis=0)[::-1]))
+    figure = new_figure(1.1 + _MAP * len(shades), tall + _HISTOGRAM + 1.1)
+    panels = figure.subplots(2, len(shades), height_ratios=[tall, _HISTOGRAM], squeeze=False)
     norm = Normalize(0.0, max(float(height_above_ground(pile).max()), 0.1))
-    for column, (name, (title, unit, _)) in enumerate(QUANTITIES.items()):
+    for column, shade in enumerate(shades):
         panel, histogram = panels[:, column]
-        label = f"{'Load' if name == 'mass' else 'Loading'} {title}"
-        values = np.asarray(getattr(diggability.performance, name), float)
+        values = np.asarray(shade.values, float)
         edges = _bins(values)
         scale = Normalize(edges[0], edges[-1])
-        colours = _MUCH_IS_GOOD if name == "mass" else _LITTLE_IS_GOOD
         draw_pile(panel, pile, STONE, norm, contour_alpha=0.35)
-        frame_map(panel, view, f"{label} [{unit}]", frame)
-        _draw_ticks(panel, ticks, colours(scale(values)))
-        _draw_histogram(histogram, values, edges, scale, colours)
-        histogram.set_title(
-            f"median {np.median(values):.3g} {unit}, {values.min():.3g} to {values.max():.3g}",
-            fontsize=9,
-            color=FAINT,
+        title = f"{shade.title[:1].upper()}{shade.title[1:]} [{shade.unit}]"
+        frame_map(panel, view, title, frame)
+        _draw_ticks(panel, ticks, shade.colours(scale(values)))
+        _draw_histogram(histogram, values, edges, scale, shade.colours)
+        middle, low, high = (
+            f"{value:,.{shade.digits}f}" for value in (shade.median, values.min(), values.max())
         )
-        histogram.set_xlabel(f"{label.lower()} [{unit}]")
+        words = f"median {middle} {shade.unit}, {low} to {high}"
+        histogram.set_title(words, fontsize=9, color=FAINT)
+        histogram.set_xlabel(f"{shade.title} [{shade.unit}]")
         if column:
             panel.set_ylabel("")
             panel.tick_params(labelleft=False)
+    draw_orientation(panels[0, 0], view, digs)
     panels[1, 0].set_ylabel("locations")
     return figure
 

@@ -1,95 +1,73 @@
-"""The digs of a plan on a map, their numbers placed so that no line crosses another."""
+"""The digs of a plan on a map: arrows in the colour of their order, the numbers in their tails."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
-from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from wlplan.report.figures.relief import RISE, height_above_ground
-from wlplan.report.figures.style import BLUE, PANEL_WIDTH, add_arrow
-from wlplan.types import Pile
+from wlplan.report.figures.style import INK, add_arrow
+from wlplan.report.legs import approaches
 
-# Radius of the numbers of the digs, as a part of the longer side of the view.
-LABEL_PART = 0.02
-# More digs than this have colours instead of numbers.
+ORDER = LinearSegmentedColormap.from_list("order", ("#5bb8f0", "#1f5fa8", "#0b1f3a"))
+"""Light to dark, told apart by everybody, and none of them the colour of soil."""
+# Of more digs than this each tenth is numbered, and their arrows are short [m].
 MOST_NUMBERED = 20
-# Light to dark, told apart by everybody, and none of them the colour of soil.
-ORDER = LinearSegmentedColormap.from_list("order", ("#8fd3ff", "#1f5fa8", "#0b1f3a"))
+_EVERY, _SHORT = 10, 1.8
+# A number lies so many of its radii behind its dig at least.
+_BEHIND = 4.0
+# Radius of a number [inch], and its letters [point].
+_RADIUS, _LETTERS = 0.105, 8.5
+# Brightness above which letters on a colour are dark.
+_BRIGHT = 0.55
 
 
-def label_places(
-    digs: Float[np.ndarray, "n 2"], heading: Float[np.ndarray, " n"], radius: float, pile: Pile
-) -> Float[np.ndarray, "n 2"]:
-    """Places for round labels of that radius [m], off the pile, none over another or a dig.
+def order_colours(count: int) -> Float[np.ndarray, "n 4"]:
+    """The colours of loads in their order."""
+    colours: np.ndarray = ORDER(Normalize(1, max(count, 2))(np.arange(1, count + 1)))
+    return colours
 
-    The nearest free place wins, straight behind the dig before places to its side. Where the lines
-    from two labels to their digs would cross, the labels change places.
+
+def rows_numbered(count: int) -> list[int]:
+    """Rows of the digs whose numbers a map shows: all, or of many the first and each tenth."""
+    many = count > MOST_NUMBERED
+    return [n for n in range(count) if not many or n == 0 or (n + 1) % _EVERY == 0]
+
+
+def number_radius(metres_per_inch: float) -> float:
+    """Radius of a number on a map of that scale [m]."""
+    return _RADIUS * metres_per_inch
+
+
+def number_places(
+    digs: Float[np.ndarray, "n 2"],
+    heading: Float[np.ndarray, " n"],
+    radius: float,
+    rows: Sequence[int],
+) -> Float[np.ndarray, "m 2"]:
+    """Places for round numbers of that radius [m], straight behind digs.
+
+    The nearest place wins that is free of other numbers and of the tips of all arrows: so each
+    number lies on its own arrow, and none over another.
+
+    Args:
+        digs: Where the tips of all arrows are [m].
+        heading: Of them [rad].
+        radius: Of the numbers [m].
+        rows: Of the digs that get a number.
     """
-    places: list[np.ndarray] = []
-    sides = np.radians([0.0, 14.0, -14.0, 28.0, -28.0, 42.0, -42.0, 56.0, -56.0])
-    for dig, towards in zip(digs, heading, strict=True):
-        place = dig
-        for ring in range(80):
-            reach = (3.0 + 1.1 * ring) * radius
-            tries = dig - reach * np.stack(
-                [np.cos(towards + sides), np.sin(towards + sides)], axis=-1
-            )
-            taken = np.array(places).reshape(-1, 2)
-            free = (
-                (_distance(tries, digs) > 1.6 * radius)
-                & (_distance(tries, taken) > 2.15 * radius)
-                & ~_on_pile(tries, pile)
-            )
-            place = tries[int(np.argmax(free))]
-            if free.any():
-                break
-        places.append(place)
-    labels = np.array(places)
-    # Each exchange shortens the lines in all, so this ends; the bound is for ties.
-    for _ in range(len(labels) ** 2):
-        pair = _first_crossing(digs, labels)
-        if pair is None:
-            break
-        labels[list(pair)] = labels[list(pair[::-1])]
-    return labels
-
-
-def _first_crossing(
-    starts: Float[np.ndarray, "n 2"], ends: Float[np.ndarray, "n 2"]
-) -> tuple[int, int] | None:
-    """Two of the segments from starts to ends that cross; None if there are none."""
-
-    def side(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-        """Sign of the turn from a to b to c, for each pair of segments."""
-        sign: np.ndarray = np.sign(
-            (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1])
-            - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
-        )
-        return sign
-
-    p, q = starts[:, np.newaxis], ends[:, np.newaxis]
-    r, t = starts[np.newaxis], ends[np.newaxis]
-    cross = (side(p, q, r) * side(p, q, t) < 0) & (side(r, t, p) * side(r, t, q) < 0)
-    found = np.argwhere(np.triu(cross, 1))
-    return (int(found[0, 0]), int(found[0, 1])) if len(found) else None
-
-
-def _on_pile(points: Float[np.ndarray, "n 2"], pile: Pile) -> Bool[np.ndarray, " n"]:
-    """Whether points lie over cells that count as pile; never outside the map."""
-    cells = np.rint((points - np.asarray(pile.origin, float)) / pile.cell_size).astype(int)
-    shape = np.array(pile.height.shape)
-    inside = np.all((cells >= 0) & (cells < shape), axis=-1)
-    i, j = np.clip(cells, 0, shape - 1).T
-    on_pile: np.ndarray = inside & (height_above_ground(pile)[i, j] > RISE)
-    return on_pile
+    places = np.zeros((0, 2))
+    for row in rows:
+        back = -np.array([math.cos(heading[row]), math.sin(heading[row])])
+        tries = digs[row] + radius * np.arange(_BEHIND, 400.0, 0.5)[:, None] * back
+        free = (_distance(tries, digs) > 1.8 * radius) & (_distance(tries, places) > 2.1 * radius)
+        places = np.concatenate([places, tries[int(np.argmax(free))][None]])
+    return places
 
 
 def _distance(
@@ -105,67 +83,83 @@ def draw_digs(
     panel: Axes,
     digs: Float[np.ndarray, "n 2"],
     heading: Float[np.ndarray, " n"],
-    labels: Float[np.ndarray, "n 2"],
-    radius: float,
+    colours: Float[np.ndarray, "n 4"],
+    *,
+    numbers: range,
+    numbered: Sequence[int],
+    approach: float,
+    metres_per_inch: float,
 ) -> None:
-    """Dig locations, headings and numbers of a plan, on a map."""
-    panel.add_collection(
-        LineCollection(
-            list(np.stack([labels, digs], axis=1)),
-            colors=BLUE,
-            linewidths=0.7,
-            alpha=0.8,
-            zorder=5,
-        )
-    )
-    reach = 3.4 * radius
-    # The numbers fit their circles: a point is 1/72 inch.
-    low, high = panel.get_xlim()
-    points_per_metre = 72.0 * PANEL_WIDTH / (high - low)
-    for number, (dig, towards, label) in enumerate(zip(digs, heading, labels, strict=True), 1):
-        tip = dig + reach * np.array([math.cos(towards), math.sin(towards)])
-        add_arrow(panel, dig, tip, colour=BLUE, line=1.2, head=9.0, zorder=6)
-        panel.add_patch(
-            Circle(tuple(label), radius, facecolor=BLUE, edgecolor="white", linewidth=0.8, zorder=8)
-        )
-        panel.text(
-            label[0],
-            label[1],
-            str(number),
-            color="white",
-            fontsize=min(9.0, radius * points_per_metre * (1.0 if number < 100 else 0.75)),
-            fontweight="bold",
-            ha="center",
-            va="center_baseline",
-            zorder=9,
-        )
-    panel.plot(*digs.T, "o", color=BLUE, markersize=4.0, markeredgecolor="white", mew=0.6, zorder=7)
+    """Arrows along which the loader comes, up to where the bucket goes in, with numbers.
 
-
-def draw_many_digs(
-    figure: Figure,
-    panel: Axes,
-    digs: Float[np.ndarray, "n 2"],
-    heading: Float[np.ndarray, " n"],
-    radius: float,
-) -> None:
-    """Dig locations and headings, whose colours say the order, with a bar of the colours."""
-    norm = Normalize(1, len(digs))
-    back = digs - 2.2 * radius * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    colours = ORDER(norm(np.arange(1, len(digs) + 1)))
-    panel.add_collection(
-        LineCollection(
-            list(np.stack([back, digs], axis=1)), colors=colours, linewidths=1.4, zorder=6
+    Args:
+        panel: The map.
+        digs: Where the bucket goes in [m].
+        heading: Into the pile [rad].
+        colours: Of each.
+        numbers: Of the loads.
+        numbered: Rows of those whose numbers are shown.
+        approach: From where the loader waits to the dig [m].
+        metres_per_inch: Scale of the map.
+    """
+    many = len(digs) > MOST_NUMBERED
+    for n, (start, tip) in enumerate(approaches(digs, heading, _SHORT if many else approach)):
+        add_arrow(
+            panel,
+            start,
+            tip,
+            colour=colours[n],
+            line=1.1 if many else 1.9,
+            head=7.0 if many else 11.0,
+            zorder=6,
+            casing=not many,
         )
-    )
+    # Where arrows lie over each other their tips are seen.
     panel.scatter(
-        digs[:, 0], digs[:, 1], c=colours, s=20.0, edgecolors="white", linewidths=0.6, zorder=7
+        digs[:, 0],
+        digs[:, 1],
+        c=colours,
+        s=5.0 if many else 14.0,
+        edgecolors="white",
+        linewidths=0.6,
+        zorder=7,
     )
-    bar = figure.colorbar(
-        ScalarMappable(norm, ORDER),
-        cax=panel.inset_axes((0.58, 0.055, 0.38, 0.022)),
-        orientation="horizontal",
+    radius = number_radius(metres_per_inch)
+    places = number_places(digs, heading, radius, numbered)
+    for n, place in zip(numbered, places, strict=True):
+        # A number beyond the tail is led to it.
+        panel.plot(*np.stack([place, digs[n]]).T, color=colours[n], linewidth=0.8, zorder=5)
+        draw_number(panel, place, numbers[n], colours[n], radius)
+
+
+def draw_number(
+    panel: Axes,
+    place: Float[np.ndarray, "2"],
+    number: int,
+    colour: Float[np.ndarray, "4"],
+    radius: float,
+) -> None:
+    """A round number on a map, of that radius [m]."""
+    panel.add_patch(
+        Circle(
+            (float(place[0]), float(place[1])),
+            radius,
+            facecolor=colour,
+            edgecolor="white",
+            linewidth=0.8,
+            zorder=8,
+        )
     )
-    bar.set_ticks([1, len(digs)], labels=["load 1", str(len(digs))])
-    bar.ax.tick_params(labelsize=8, length=2)
-    bar.outline.set_visible(False)
+    bright = float(np.dot(colour[:3], (0.3, 0.59, 0.11))) > _BRIGHT
+    panel.text(
+        float(place[0]),
+        float(place[1]),
+        str(number),
+        color=INK if bright else "white",
+        fontsize=_LETTERS if number < 100 else 0.75 * _LETTERS,
+        fontweight="bold",
+        ha="center",
+        va="center_baseline",
+        zorder=9,
+        clip_on=True,
+    )

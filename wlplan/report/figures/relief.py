@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap, Normalize
-from matplotlib.figure import Figure
+from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
+from matplotlib.patches import Rectangle
 
-from wlplan.report.figures.style import BLUE, FAINT, INK
+from wlplan.report.figures.style import INK
+from wlplan.terrain.standing import standing
 from wlplan.types import Pile
 
 PILE = LinearSegmentedColormap.from_list(
     "pile", ["#e4e2dc", "#e8d3a8", "#d5a766", "#a97640", "#6b472b"]
 )
 STONE = LinearSegmentedColormap.from_list("stone", ["#eae9e6", "#b4b1ab"])
+
+UNSEEN: dict[str, Any] = {
+    "facecolor": "#f4f4f2",
+    "edgecolor": "#d3d7db",
+    "hatch": "////",
+    "linewidth": 0.0,
+}
+"""How ground looks that the scan did not see."""
+
+STANDS = "#5d6875"
+"""Colour of walls and of all else that stands there and is not soil."""
 
 # Rise above the ground that counts as pile [m], as for the toe contour.
 RISE = 0.15
@@ -57,6 +70,30 @@ def grow_to_ratio(view: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
     return np.stack([view[0] - grow, view[1] + grow])
 
 
+def shaped(
+    view: Float[np.ndarray, "2 2"],
+    ratio: tuple[float, float],
+    *,
+    towards: Float[np.ndarray, "2"] | None = None,
+) -> Float[np.ndarray, "2 2"]:
+    """Widen one side of a view until its height over its width is within limits.
+
+    Args:
+        view: Lower left and upper right corner [m].
+        ratio: The least and the largest.
+        towards: A place to grow to, if it is not in the middle [m]; None: to both sides alike.
+    """
+    width, height = (float(side) for side in np.ptp(view, axis=0))
+    least, most = ratio
+    grow = np.array([max(height / most - width, 0.0), max(least * width - height, 0.0)])
+    share = np.full(2, 0.5)
+    if towards is not None:
+        # The place comes to the middle, as far as that goes.
+        want = (towards - view.mean(axis=0)) / np.maximum(grow, 1e-9) + 0.5
+        share = np.clip(want, 0.0, 1.0)
+    return np.stack([view[0] - (1.0 - share) * grow, view[1] + share * grow])
+
+
 def _relief(height: Float[np.ndarray, "nx ny"], cell_size: float) -> Float[np.ndarray, "nx ny"]:
     """Brightness of a surface lit from the north-west, 1 where it is level."""
     # Light from 315 degrees at 40 degrees above the horizon; slopes are drawn 1.3 times as steep.
@@ -81,7 +118,9 @@ def draw_pile(
     """Shaded heights above the ground, contour lines, and hatching over unseen cells."""
     above = height_above_ground(pile)
     surface = np.asarray(pile.height, float)
-    image = colours(norm(above))[..., :3] * _relief(surface, pile.cell_size)[..., np.newaxis]
+    image = colours(norm(above))[..., :3]
+    image[standing(np.asarray(pile.floor), pile.cell_size)] = to_rgb(STANDS)
+    image = image * _relief(surface, pile.cell_size)[..., np.newaxis]
     panel.imshow(
         np.clip(image, 0.0, 1.0).transpose(1, 0, 2),
         origin="lower",
@@ -89,8 +128,10 @@ def draw_pile(
         interpolation="bilinear",
         zorder=1,
     )
+    # Beyond the scan nothing was seen either.
+    panel.add_patch(Rectangle((0.0, 0.0), 1.0, 1.0, transform=panel.transAxes, zorder=0, **UNSEEN))
     x, y = _axes_of(pile)
-    step = _contour_step(float(norm.vmax or 0.0))
+    step = contour_step(float(norm.vmax or 0.0))
     levels = np.arange(step, float(above.max()), step)
     if levels.size:
         panel.contour(
@@ -106,10 +147,16 @@ def _hatch(panel: Axes, pile: Pile, unseen: Bool[np.ndarray, "nx ny"]) -> None:
     x, y = _axes_of(pile)
     x, y = (np.concatenate([[2 * a[0] - a[1]], a, [2 * a[-1] - a[-2]]]) for a in (x, y))
     grey = panel.contourf(
-        x, y, flags.T, levels=[0.5, 1.5], colors=["#f4f4f2"], alpha=0.8, hatches=["////"], zorder=3
+        x,
+        y,
+        flags.T,
+        levels=[0.5, 1.5],
+        colors=[UNSEEN["facecolor"]],
+        hatches=[UNSEEN["hatch"]],
+        zorder=3,
     )
-    grey.set_edgecolor("#9aa1a8")
-    grey.set_linewidth(0.0)
+    grey.set_edgecolor(UNSEEN["edgecolor"])
+    grey.set_linewidth(UNSEEN["linewidth"])
 
 
 def draw_toe(panel: Axes, pile: Pile, style: str) -> None:
@@ -120,8 +167,8 @@ def draw_toe(panel: Axes, pile: Pile, style: str) -> None:
             *_axes_of(pile),
             above.T,
             levels=[RISE],
-            colors=[BLUE],
-            linewidths=0.9,
+            colors=[INK],
+            linewidths=1.1,
             linestyles=style,
             zorder=4,
         )
@@ -134,24 +181,6 @@ def _axes_of(pile: Pile) -> tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " 
     return origin[0] + pile.cell_size * np.arange(nx), origin[1] + pile.cell_size * np.arange(ny)
 
 
-def _contour_step(highest: float) -> float:
-    """Spacing of contour lines for a pile of that height [m]."""
+def contour_step(highest: float) -> float:
+    """Spacing of contour lines on a pile of that height [m]."""
     return next((s for s in _CONTOUR_STEPS if highest / s >= _LEAST_CONTOURS), _CONTOUR_STEPS[-1])
-
-
-def add_legend(
-    figure: Figure, pile: Pile, digs: str, *, ways: bool = False, area: bool = False
-) -> None:
-    """One line under the maps that says what their lines mean, and how digs are drawn."""
-    parts = [
-        f"contour lines every {_contour_step(float(height_above_ground(pile).max())):g} m",
-        digs,
-        "blue outline: toe before",
-    ]
-    if ways:
-        parts.append("way to the truck: dashed in reverse, then solid")
-    if area:
-        parts.append("green outline: where trucks may stand")
-    if pile.valid is not None and not np.asarray(pile.valid).all():
-        parts.append("hatched: not seen by the scan")
-    figure.supxlabel("   ·   ".join(parts), fontsize=8.5, color=FAINT)

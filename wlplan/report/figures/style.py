@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -30,6 +31,19 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
+def bare_figure(width: float, height: float) -> Figure:
+    """As `new_figure`, but who draws says where axes are, see `axes_at`."""
+    figure = Figure(figsize=(width, height), facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def axes_at(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
+    """New axes at a place of a figure, counted from its lower left [inch]."""
+    across, up = (float(side) for side in figure.get_size_inches())
+    return figure.add_axes((left / across, bottom / up, width / across, height / up))
+
+
 def map_panels(view: Float[np.ndarray, "2 2"], count: int) -> tuple[Figure, list[Axes]]:
     """A row of panels that fit a view."""
     size = np.ptp(view, axis=0)
@@ -49,10 +63,18 @@ def frame_map(
     panel.set_ylabel("y, north [m]")
     panel.set_facecolor("white")
     for axis, offset in ((panel.xaxis, frame.offset[0]), (panel.yaxis, frame.offset[1])):
+        # Coordinates of a survey are long.
+        axis.set_major_locator(MaxNLocator(4 if offset else 7, steps=[1, 2, 5, 10]))
         if offset:
-            axis.set_major_locator(MaxNLocator(4))
             axis.set_major_formatter(_shifted(offset))
     tidy(panel, grid=False)
+
+
+def without_coordinates(panel: Axes) -> None:
+    """Takes the coordinates off the axes of a map."""
+    panel.tick_params(labelleft=False, labelbottom=False, length=0)
+    panel.set_xlabel("")
+    panel.set_ylabel("")
 
 
 def _shifted(offset: float) -> FuncFormatter:
@@ -79,10 +101,11 @@ def add_arrow(
     start: Float[np.ndarray, "2"],
     end: Float[np.ndarray, "2"],
     *,
-    colour: str,
+    colour: str | Float[np.ndarray, "4"],
     line: float,
     head: float,
     zorder: int,
+    casing: bool = False,
 ) -> None:
     """An arrow on a map, from point to point [m].
 
@@ -94,17 +117,20 @@ def add_arrow(
         line: Width of the line [point].
         head: Size of the head [point].
         zorder: Arrows are drawn over what has a smaller one.
+        casing: Whether it has a white edge, to stand out from what is under it.
     """
+    edge = [patheffects.withStroke(linewidth=line + 1.4, foreground="white", alpha=0.8)]
     panel.add_patch(
         FancyArrowPatch(
-            tuple(start),
-            tuple(end),
+            (float(start[0]), float(start[1])),
+            (float(end[0]), float(end[1])),
             arrowstyle="-|>",
             mutation_scale=head,
             color=colour,
             linewidth=line,
             shrinkA=0.0,
             shrinkB=0.0,
+            path_effects=edge if casing else None,
             zorder=zorder,
         )
     )

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from matplotlib import patches
 from matplotlib.axes import Axes
 
-from wlplan.report.figures.style import GREEN, INK, PALE, add_arrow
+from wlplan.report.figures.style import GREEN, INK, PALE
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.polygon import Polygon
 from wlplan.site.receiver import Receiver, receiver_for, stands_of, truck_outline
@@ -35,10 +35,9 @@ class Truck:
         return np.array([math.cos(heading), math.sin(heading)])
 
     @property
-    def way(self) -> Float[np.ndarray, "2 2"]:
-        """Start and end of the last stretch of the loader's way."""
-        stand = np.array([float(self.receiver.x), float(self.receiver.y)])
-        return np.stack([stand - 4.0 * self.ahead, stand])
+    def stand(self) -> Float[np.ndarray, "2"]:
+        """Middle of the loader as it dumps."""
+        return np.array([float(self.receiver.x), float(self.receiver.y)])
 
     @property
     def body(self) -> Float[np.ndarray, "4 2"]:
@@ -50,11 +49,16 @@ class Truck:
         """What is loaded: the body without the cab at its left end."""
         return self._box(-0.10, 0.72, 0.84)
 
+    @property
+    def cab(self) -> Float[np.ndarray, "4 2"]:
+        """What stands before the bed."""
+        return self._box(0.385, 0.23, 1.0)
+
     def _box(self, shift: float, long: float, wide: float) -> Float[np.ndarray, "4 2"]:
         near, far, half = truck_outline(self.machine)
         length, width = 2.0 * half, far - near
         left = np.array([-self.ahead[1], self.ahead[0]])
-        centre = self.way[1] + 0.5 * (near + far) * self.ahead + shift * length * left
+        centre = self.stand + 0.5 * (near + far) * self.ahead + shift * length * left
         along, across = 0.5 * long * length * left, 0.5 * wide * width * self.ahead
         corners: np.ndarray = centre + np.stack(
             [along + across, along - across, -along - across, across - along]
@@ -108,15 +112,19 @@ def draw_truck(panel: Axes, truck: Truck, view: Float[np.ndarray, "2 2"]) -> Non
     panel.add_patch(
         patches.Polygon(truck.bed, closed=True, facecolor=PALE, edgecolor="none", zorder=7)
     )
-    add_arrow(panel, *truck.way, colour=INK, line=1.6, head=11.0, zorder=7)
-    panel.annotate(
+    # Along the truck, and never upside down.
+    turn = math.degrees(math.atan2(*truck.ahead[::-1])) + 90.0
+    x, y = truck.bed.mean(axis=0)
+    panel.text(
+        x,
+        y,
         truck.name,
-        tuple(truck.way[0]),
-        textcoords="offset points",
-        xytext=tuple(-12.0 * truck.ahead),
+        rotation=(turn + 90.0) % 180.0 - 90.0,
+        rotation_mode="anchor",
         ha="center",
         va="center",
-        fontsize=9,
+        fontsize=8.5,
         color=INK,
+        clip_on=True,
         zorder=8,
     )
