@@ -314,7 +314,7 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     part = held_out(dataset, description)
     # What was held out of its own data has piles that are new to it.
     if part is dataset and shares_piles(dataset, description):
-        seed_of = dataset.attributes["seed"]
+        seed_of = dataset.attributes.get("seed")
         remark(
             f"{data} has seed {seed_of}, as a data set of the model's training: the model has seen "
             f"some of these piles, and its errors on them are smaller. Collect with another seed."

@@ -299,7 +299,8 @@ def simulate(
     )
     objective = given.get("objective")
     # A plan file must not make us import somebody else's module.
-    objective = objective if objective in OBJECTIVES else next(iter(OBJECTIVES))
+    if not isinstance(objective, str) or objective not in OBJECTIVES:
+        objective = next(iter(OBJECTIVES))
     places = None if truck is not None else _places_of_trucks(given, frame)
     if places is None:
         place = site.with_receiver(named, truck if truck is not None else _truck_of(given, frame))

@@ -20,6 +20,7 @@ from wlplan.dataset.layout import Layout
 from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, h36_after
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError, one_line
+from wlplan.io.documents import check_kinds, parse_json
 from wlplan.io.files import atomic_folder, replace_file
 from wlplan.io.provenance import command, versions
 
@@ -28,6 +29,12 @@ DATASET_FORMAT = "wlplan.dataset/1"
 SHARD_ATTRIBUTES = ("shard", "shards", "first_cycle", "whole_cycles")
 """Attributes that a shard has and a whole data set has not."""
 
+# What attributes are that are looked at; a number of them may be missing in older data sets.
+_KINDS: dict[str, type] = {
+    **dict.fromkeys((*SHARD_ATTRIBUTES, "cycles", "cycles_done", "seed", "loads"), int),
+    **dict.fromkeys(("soil", "machine", "settings", "schedule", "versions"), dict),
+    "protocol": str,
+}
 # A lock that is empty for longer was left by a process that died before it signed it [s].
 _SIGNING_TIME = 10.0
 
@@ -178,12 +185,13 @@ def read_attributes(path: Path) -> dict[str, Any]:
     if not os.path.lexists(path):
         raise InputError(f"{path}: no such data set: check the name, or collect it first.")
     try:
-        attributes: dict[str, Any] = json.loads((path / "zarr.json").read_text("utf-8"))[
-            "attributes"
-        ]
+        attributes: dict[str, Any] = parse_json((path / "zarr.json").read_bytes())["attributes"]
         found = attributes.get("format")
         if found == DATASET_FORMAT:
-            int(attributes["cycles"]), int(attributes["cycles_done"])
+            check_kinds(attributes, _KINDS)
+            check_kinds(attributes.get("soil", {}), {"density": (int, float)})
+            if not 0 <= attributes["cycles_done"] <= attributes["cycles"]:
+                raise ValueError("more cycles than it has room for")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path}: is not a data set of wlplan: name a directory that `wlplan collect` wrote."
@@ -305,6 +313,8 @@ def open_dataset(path: str | os.PathLike[str]) -> Dataset:
             array = group[name]
             if not isinstance(array, zarr.Array) or array.nchunks_initialized < array.nchunks:
                 raise ValueError(f"parts of {name} are missing")
+            if not np.can_cast(array.dtype, variable.dtype, "same_kind"):
+                raise ValueError(f"{name} is of type {array.dtype}")
             columns[name] = np.asarray(array[...])
             if columns[name].shape != (cycles, *variable.shape):
                 raise ValueError(f"{name} has shape {columns[name].shape}")

@@ -8,6 +8,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -207,6 +208,9 @@ def check_is_file(path: Path, what: str) -> None:
         raise InputError(f"{path}: is a folder: name the {what} file itself.")
     if not os.path.exists(path):
         raise InputError(f"{path}: no such {what} file: check the name.")
+    # Some of them never end. A pipe does, and may be how a file is given.
+    if stat.S_ISCHR(kind := os.stat(path).st_mode) or stat.S_ISBLK(kind):
+        raise InputError(f"{path}: is a device: name a {what} file.")
 
 
 @contextlib.contextmanager

@@ -36,8 +36,8 @@ _ALONE = {
     "GDAL_PAM_ENABLED": "NO",
     "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".none",
 }
-# Where its metadata name other files: GDAL, gcore/gdaldefaultoverviews.cpp.
-_ELSEWHERE = ("OVERVIEWS", "ProxyOverviewRequest")
+# Where its metadata name another file: GDAL, gcore/gdaldefaultoverviews.cpp.
+_ELSEWHERE = "OVERVIEWS"
 # World files of `a.tif`: six numbers, a line each.
 _WORLD_FILES, _LONGEST_WORLD_FILE = (".tfw", ".tifw", ".wld", ".TFW"), 4096
 # What bands of heights are called.
@@ -72,7 +72,7 @@ def read(path: Path, *, band: int | None = None, crop: Box | None = None) -> Hei
         rasterio.Env(**_ALONE),
         rasterio.open(place, driver="GTiff") as file,
     ):
-        if any(file.tags(ns=domain) for domain in _ELSEWHERE):
+        if file.tags(ns=_ELSEWHERE):
             raise InputError("names other files for its overviews: export it again without them.")
         _check_blocks(file)
         georeference = file.transform
@@ -171,7 +171,7 @@ def _world_file(rasterio: Any, path: Path) -> Any:
         except (OSError, ValueError):
             continue
         # It names the middle of the first cell, and not its corner.
-        step = rasterio.Affine(a, b, x, d, e, y) * rasterio.Affine.translation(-0.5, -0.5)
+        step = rasterio.Affine(a, b, x - 0.5 * (a + b), d, e, y - 0.5 * (d + e))
         if all(map(math.isfinite, step)):
             return step
     return None
