@@ -54,7 +54,7 @@ def bench(names: tuple[str, ...], quick: bool, out: str | None, seed: int, as_js
 
     Compiling and running are timed separately. With --out: bench.json.
     """
-    folder = None if out is None else checked_folder(out)
+    folder = None if out is None else checked_folder(out, ["bench.json"])
 
     from wlplan.studies.bench import run_bench
 

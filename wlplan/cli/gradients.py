@@ -101,7 +101,7 @@ def gradcheck(
             f"--loads {loads} takes too long in the simulator: ask for at most "
             f"{_MOST_LOADS_SIMULATOR}, or check another world."
         )
-    folder = None if out is None else checked_folder(out)
+    folder = None if out is None else checked_folder(out, ["gradcheck.json"])
 
     from wlplan.io import plan_to_dict
     from wlplan.planning.job import make_job

@@ -36,6 +36,7 @@ from wlplan.cli.values import ActionNumbers
 from wlplan.constants import QUANTITIES
 
 _FORMAT = "wlplan.diggability/1"
+_FILES = ("diggability.png", "diggability.json")
 _MOST_LOCATIONS = 10_000
 
 
@@ -84,7 +85,7 @@ def diggability(
     check_pile_name(pile_file.name)
     check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
-    folder = None if out is None else checked_folder(out)
+    folder = None if out is None else checked_folder(out, _FILES)
 
     import numpy as np
 
@@ -133,7 +134,7 @@ def diggability(
         from wlplan.report import figures as plots
 
         png = plots.png_bytes(plots.diggability_figure(pile, found, frame=named.frame))
-        write_files(folder, {"diggability.png": png, "diggability.json": f"{text}\n"})
+        write_files(folder, dict(zip(_FILES, (png, f"{text}\n"), strict=True)))
     if as_json:
         click.echo(text)
         return

@@ -6,7 +6,7 @@ import json
 import os
 import secrets
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,29 @@ from wlplan.cli.verbosity import is_asked
 from wlplan.errors import InputError, one_line
 
 
-def checked_folder(name: str) -> Path:
+def checked_folder(name: str, files: Iterable[str] = ()) -> Path:
     """A folder to write to, found out to be possible before anything long is begun.
 
+    Args:
+        name: Path of the folder.
+        files: Names of the files that are to be written into it.
+
     Raises:
-        InputError: If it is a file, below one, or cannot be written.
+        InputError: If it is a file, below one, or cannot be written; or one of the files is there
+            and not from us.
     """
+    from wlplan.io.files import is_ours
+
     if not name.strip():
         raise InputError("the name of the folder to write to is empty: give one.")
     if os.path.lexists(name) and not os.path.isdir(name):
         raise InputError(f"{name}: is a file: name a folder to write to.")
     folder = Path(name)
+    for file in files:
+        if os.path.lexists(folder / file) and not is_ours(folder / file):
+            raise InputError(
+                f"{folder / file}: is there and not from wlplan: name another folder, or move it."
+            )
     place = folder.absolute()
     while not os.path.lexists(place):
         place = place.parent

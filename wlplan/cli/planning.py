@@ -45,12 +45,15 @@ from wlplan.constants import QUANTITIES
 from wlplan.errors import InputError
 from wlplan.planning.objectives import OBJECTIVES
 from wlplan.report.exports import check as check_exports
+from wlplan.report.exports import names as names_of_exports
 
 if TYPE_CHECKING:
     from wlplan.planning.amounts import Amount
     from wlplan.site.frame import Frame
     from wlplan.types import Performance
 
+# Files that a plan is written as, apart from exports; a test compares them.
+_FILES = ("plan.json", "plan.png", "totals.png", "report.html")
 # Exit code after Ctrl-C, also if there was a plan to show.
 _INTERRUPTED = 130
 # What a plan says about where it comes from; kept when it is played again.
@@ -218,7 +221,7 @@ def _folder_of(out: str | None, also: Sequence[str]) -> Path | None:
     if also and out is None:
         raise InputError("--also needs a folder to write to: give --out DIR.")
     check_exports(also)
-    return None if out is None else checked_folder(out)
+    return None if out is None else checked_folder(out, [*_FILES, *names_of_exports(also)])
 
 
 def _print_written(folder: Path | None, written: list[str] | None) -> None:

@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import json
 import os
+import re
 import socket
 import time
 import warnings
@@ -35,6 +36,8 @@ _KINDS: dict[str, type] = {
     **dict.fromkeys(("soil", "machine", "settings", "schedule", "versions"), dict),
     "protocol": str,
 }
+# How a lock is signed: number and start of the process, and its host.
+_SIGNED = re.compile(r"\d+ \S+ .*")
 # A lock that is empty for longer was left by a process that died before it signed it [s].
 _SIGNING_TIME = 10.0
 
@@ -230,6 +233,10 @@ def lock(path: Path) -> Iterator[None]:
             holder = ""
             with contextlib.suppress(OSError):
                 holder = lock.read_text("utf-8")
+            if holder and not _SIGNED.fullmatch(holder):
+                raise InputError(
+                    f"{path}: {lock.name} is beside it and no lock of wlplan: choose another name."
+                ) from None
             if _is_alive(holder) or (not holder and _is_young(lock)) or attempt > 2:
                 raise InputError(
                     f"{path}: is being written by process {holder.split(' ')[0] or '?'}: wait for "

@@ -50,7 +50,7 @@ def check_kinds(record: Mapping[str, Any], kinds: Mapping[str, type | tuple[type
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise InputError(f"holds {one_line(text)}: every number has to be finite.")
+        raise InputError(f"holds {one_line(text)}, which is not a finite number: write it again.")
     return value
 
 

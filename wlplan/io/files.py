@@ -201,6 +201,29 @@ def _remove_leftovers(place: Path) -> None:
             _remove_folder(entry)
 
 
+MADE_BY = "made by wlplan"
+"""What every file that is no JSON says in its head or tail, so that we know it for ours."""
+
+# What says so in JSON, and how much of a file is looked at from either end.
+_FORMAT = re.compile(rb'"format":\s*"wlplan\.')
+_ENDS = 1 << 16
+
+
+def is_ours(path: Path) -> bool:
+    """Whether a file says that wlplan has written it; no for what cannot be read."""
+    try:
+        # A pipe would have to be waited for.
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            return False
+        with path.open("rb") as file:
+            ends = [file.read(_ENDS)]
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _ENDS))
+            ends.append(file.read(_ENDS))
+    except OSError:
+        return False
+    return any(MADE_BY.encode() in end or _FORMAT.search(end) for end in ends)
+
+
 def check_is_file(path: Path, what: str) -> None:
     """Refuse a path that is missing or a folder; `what` says what kind of file it should be."""
     # Unlike Path.exists, these take names that no file can have for missing ones.

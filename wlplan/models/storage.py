@@ -21,7 +21,7 @@ from flax import nnx
 
 from wlplan.errors import InputError, one_line
 from wlplan.io.documents import check_kinds, parse_json
-from wlplan.io.files import atomic_folder, named
+from wlplan.io.files import atomic_folder, is_ours, named
 from wlplan.io.provenance import command, versions
 from wlplan.models.ensemble import Ensemble, members_of
 from wlplan.models.grid import GRID
@@ -263,10 +263,12 @@ def check_target(directory: Path) -> None:
     if not directory.is_dir():
         raise InputError(f"{directory}: is a file: name a directory for the model.")
     with contextlib.suppress(OSError):
-        if any(directory.iterdir()) and not (directory / _DESCRIPTION).is_file():
-            raise InputError(
-                f"{directory}: holds something that is not a model: choose another place."
-            )
+        found = {entry.name for entry in directory.iterdir()}
+        others = sorted(found - {_DESCRIPTION, _WEIGHTS})
+        # It is replaced as a whole.
+        if others or (found and not is_ours(directory / _DESCRIPTION)):
+            what = one_line(others[0]) if others else "something"
+            raise InputError(f"{directory}: is not a model, it holds {what}: choose another place.")
 
 
 def _digests(directory: Path) -> dict[str, str]:
