@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import click
 
 from wlplan.cli import benchmark, gradients, info, kept, learning, maps, planning, programs
+from wlplan.cli.said import mend_streams, tell
 from wlplan.errors import InputError
 
 # Commands in which nothing is compiled.
@@ -71,6 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 0 done, 1 a fault of wlplan, 2 bad input or usage, 130 interrupted.
     """
+    mend_streams()
     if "_WLPLAN_COMPLETE" in os.environ:  # the shell asks for completions
         wlplan.main(prog_name="wlplan")
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -114,8 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _fail(message: str, code: int) -> int:
     text = " ".join(message.split())
-    with contextlib.suppress(OSError, ValueError):
-        print(f"error: {text if len(text) <= 600 else text[:597] + '...'}", file=sys.stderr)
+    tell(f"error: {text if len(text) <= 600 else text[:597] + '...'}")
     return code
 
 

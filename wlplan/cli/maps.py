@@ -32,6 +32,7 @@ from wlplan.cli.outputs import (
     write_files,
 )
 from wlplan.cli.progress import Progress, Stopwatch, ready
+from wlplan.cli.said import say
 from wlplan.cli.values import ActionNumbers
 from wlplan.constants import QUANTITIES
 
@@ -150,6 +151,6 @@ def diggability(
             f"{math.degrees(records['heading'][best]):.0f}",
         )
     print_table(table)
-    print(f"map {mapping.text()}")
+    say(f"map {mapping.text()}")
     if folder is not None:
-        print(f"written: {folder / 'diggability.png'}, and diggability.json beside it")
+        say(f"written: {folder / 'diggability.png'}, and diggability.json beside it")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import secrets
@@ -12,8 +13,9 @@ from typing import Any
 
 import click
 
+from wlplan.cli.said import tell
 from wlplan.cli.verbosity import is_asked
-from wlplan.errors import InputError, one_line
+from wlplan.errors import InputError, one_line, shown
 
 
 def checked_folder(name: str, files: Iterable[str] = ()) -> Path:
@@ -91,7 +93,7 @@ def json_text(document: Mapping[str, Any]) -> str:
 def remark(text: str) -> None:
     """Print on stderr what is worth knowing but no error."""
     if not is_asked("quiet"):
-        print(f"note: {text}", file=sys.stderr)
+        tell(f"note: {text}")
 
 
 def titled_table(title: str) -> Any:
@@ -100,7 +102,7 @@ def titled_table(title: str) -> Any:
     from rich.table import Table
 
     return Table(
-        title=title,
+        title=shown(title),
         title_justify="left",
         title_style="bold",
         box=box.SIMPLE_HEAD,
@@ -115,10 +117,15 @@ def print_table(table: Any) -> None:
 
     # A file or a pipe has no width of its own: take what the table needs.
     width = None if sys.stdout.isatty() else 140
-    # Units stand in square brackets, which would count as markup.
-    Console(width=width, highlight=False, markup=False).print(table)
+    # Units stand in square brackets, which would count as markup. On a stream whose reader has gone
+    # the library would end the process by itself.
+    buffer, terminal = io.StringIO(), sys.stdout.isatty()
+    Console(file=buffer, force_terminal=terminal, width=width, highlight=False, markup=False).print(
+        table
+    )
+    sys.stdout.write(buffer.getvalue())
 
 
 def print_bold(text: str) -> None:
     """Print on stdout what is to be seen first, bold where there is a terminal."""
-    print(click.style(text, bold=True) if sys.stdout.isatty() else text)
+    print(click.style(shown(text), bold=True) if sys.stdout.isatty() else shown(text))

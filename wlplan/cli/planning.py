@@ -41,6 +41,7 @@ from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.plan_table import print_plan, remark_on_ledger
 from wlplan.cli.programs import cache_of_command
 from wlplan.cli.progress import Progress, Stopwatch, ready
+from wlplan.cli.said import say
 from wlplan.constants import QUANTITIES
 from wlplan.errors import InputError
 from wlplan.planning.objectives import OBJECTIVES
@@ -206,7 +207,7 @@ def plan(
         click.echo(text)
     else:
         print_plan(document)
-        print("; ".join(f"{name} {text}" for name, text in seconds.items()))
+        say("; ".join(f"{name} {text}" for name, text in seconds.items()))
         _print_written(folder, written)
     if planned.stopped == "interrupted":
         raise click.exceptions.Exit(_INTERRUPTED)
@@ -226,10 +227,10 @@ def _folder_of(out: str | None, also: Sequence[str]) -> Path | None:
 
 def _print_written(folder: Path | None, written: list[str] | None) -> None:
     if folder is None or written is None:
-        print("nothing written: --out DIR writes the plan, the figures and a report")
+        say("nothing written: --out DIR writes the plan, the figures and a report")
         return
     first, *others = written
-    print(f"written: {folder / first}, and {', '.join(others)} beside it")
+    say(f"written: {folder / first}, and {', '.join(others)} beside it")
 
 
 @click.command(
@@ -377,7 +378,7 @@ def simulate(
         click.echo(text)
         return
     print_plan(document)
-    print(f"{engine} {playing.text()}")
+    say(f"{engine} {playing.text()}")
     _print_written(folder, written)
 
 

@@ -80,6 +80,8 @@ def read_areas(path: Path, kinds: tuple[str, ...] = KINDS) -> tuple[Area, ...]:
             raise InputError(
                 f"cannot be read ({one_line(error.strerror or error)}): check the file."
             ) from error
+        except InputError as error:
+            raise InputError(f"is not GeoJSON: it {error}") from error
         features = document.get("features") if isinstance(document, dict) else None
         if features is None and isinstance(document, dict):
             features = [document if "geometry" in document else {"geometry": document}]

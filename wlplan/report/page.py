@@ -19,6 +19,7 @@ from jinja2 import ChainableUndefined, Environment, PackageLoader, Template
 from markupsafe import Markup
 
 from wlplan.constants import QUANTITIES
+from wlplan.errors import shown
 from wlplan.io import write_text_atomic
 from wlplan.models.ensemble import PERCENT_90
 from wlplan.report.headline import FUEL_A_MEGAJOULE, headline, trucks_said
@@ -107,6 +108,8 @@ def _plotly() -> Markup:
 def _template() -> Template:
     environment = Environment(
         autoescape=True,
+        # A name of a file may hold what is no character.
+        finalize=lambda value: shown(value) if type(value) is str else value,
         loader=PackageLoader("wlplan", "report"),
         undefined=ChainableUndefined,
         trim_blocks=True,

@@ -99,7 +99,8 @@ class Simulator(struct.PyTreeNode):
             The pile after, relaxed, the performance, and how the automaton ended.
         """
         window, start = window_of(pile, pose)
-        # What left the grid is the load: float rounding of the time stepping goes to the mass.
+        # What left the grid is the load, though the loader dug beyond the edge of the map or deeper
+        # than there is soil; float rounding of the time stepping goes to the mass.
         change = cycle.height - height
         dug, missing = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
         settled = settle_dug(
@@ -111,7 +112,9 @@ class Simulator(struct.PyTreeNode):
         )
         work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
         performance = Performance(
-            mass=cycle.mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ
+            mass=jnp.maximum(cycle.mass - self.soil.density * missing, 0.0) / KG_PER_TONNE,
+            time=cycle.time,
+            work=work / J_PER_KJ,
         )
         report = SolveReport(settled.rounds, settled.at_rest, settled.steepest_slope, missing)
         return settled.pile, performance, report
