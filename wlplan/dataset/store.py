@@ -228,7 +228,7 @@ def lock(path: Path) -> Iterator[None]:
     mine = f"{os.getpid()} {_start_of(os.getpid())} {socket.gethostname()}"
     for attempt in itertools.count():
         try:
-            handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+            handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
         except FileExistsError:
             holder = ""
             with contextlib.suppress(OSError):

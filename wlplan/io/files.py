@@ -15,6 +15,9 @@ from typing import Literal
 
 from wlplan.errors import InputError, one_line
 
+# Windows would else change the ends of lines.
+_BINARY = getattr(os, "O_BINARY", 0)
+
 
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file as UTF-8, in one piece or not at all: see `write_bytes_atomic`."""
@@ -43,10 +46,13 @@ def replace_file(path: Path, content: bytes) -> None:
     """
     temporary = _temporary(path)
     try:
-        with temporary.open("xb") as file:
+        # Nobody else reads or changes it before it is whole.
+        handle = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY | _BINARY, 0o600)
+        with os.fdopen(handle, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
+        temporary.chmod(0o666 & ~_mask())
         os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError):
@@ -100,8 +106,9 @@ def atomic_folder(
         # Files are added from inside the folder: it may be all that can be written to.
         temporary = _temporary(place / place.name if adds else place)
         try:
-            temporary.mkdir()
+            temporary.mkdir(0o700)
             yield temporary
+            temporary.chmod(0o777 & ~_mask())
             if adds:
                 _move_files(temporary, place)
             elif existing == "replace" and place.is_dir():
@@ -184,6 +191,14 @@ def _remove_folder(folder: Path) -> None:
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
+
+
+def _mask() -> int:
+    """Permissions that the user wants no new file to have."""
+    # It can only be read by being set: to what is harmless for the files of other threads.
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
 
 
 def _temporary(path: Path) -> Path:
