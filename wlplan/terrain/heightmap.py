@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -169,6 +170,9 @@ def add_local_change(
         The surface after [m], and what was to be lost and is not, for want of soil [m^3].
     """
     n = change.shape[0]
+    # A batch of changes at one pose: compiled for a CPU, sums over the grid are off by some percent
+    # unless the pose belongs to the batch too.
+    pose = jax.tree.map(lambda value: value + 0.0 * lax.stop_gradient(change[0, 0]), pose)
     # The map reaches half a diagonal on either side of its middle, wherever it is turned to.
     middle = to_world(pose, jnp.asarray(0.5 * (n - 1) * CELL_SIZE - displacement), jnp.asarray(0.0))
     reach = math.sqrt(2.0) * (n + 1) * CELL_SIZE / window.cell_size
