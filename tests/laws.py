@@ -22,6 +22,28 @@ def assert_volume_kept(before: ArrayLike, after: ArrayLike, *, relative: float =
     assert abs(now - was) <= relative * abs(was), f"the volume changed from {was:.9g} to {now:.9g}"
 
 
+def assert_no_soil_from_nowhere(
+    before: Pile, after: Pile, mass: float, *, density: float, relative: float = 1e-6
+) -> None:
+    """A load is what left the pile, to `relative` of the pile; it is not negative, nor dug deeper.
+
+    Args:
+        before: Pile before the load.
+        after: Pile after it.
+        mass: Of the load [tonne].
+        density: Of the soil [tonne/m^3].
+        relative: Largest part of the mass of the pile that may be off.
+    """
+    surfaces = [np.asarray(pile.height, np.float64) for pile in (before, after)]
+    floor = np.asarray(before.floor, np.float64)
+    was, now = (density * float((s - floor).sum()) * before.cell_size**2 for s in surfaces)
+    assert mass >= 0.0, f"the load has a mass of {mass:g} t"
+    bound = relative * max(was, 1.0)
+    assert abs(was - now - mass) <= bound, f"{was - now:.9g} t left the pile, {mass:.9g} t were got"
+    dug = float((surfaces[1] - floor).min())
+    assert dug >= -1e-6, f"it is dug {-dug:g} m below its floor"
+
+
 def assert_gradient(
     function: Callable[[Any], jax.Array],
     point: Any,

@@ -19,7 +19,9 @@ from matplotlib.figure import Figure
 from pages import Page
 
 from wlplan import cli, dataset, io
+from wlplan.cli import planning
 from wlplan.errors import InputError
+from wlplan.io.files import is_ours
 from wlplan.io.upright import TURNS
 from wlplan.planning import objective
 from wlplan.planning import plan as planner
@@ -43,6 +45,8 @@ from wlplan.worlds import shipped as worlds
 Run = Callable[..., tuple[int, str, str]]
 
 FILES = ["plan.json", "plan.png", "report.html", "totals.png"]
+# An older file of ours.
+OLD = '{"format": "wlplan.plan/1"}'
 
 
 class FakeWorld:
@@ -199,6 +203,8 @@ def test_a_plan_is_written_with_figures_and_report(
     for unit in ("[t]", "[s]", "[kJ]", "[m]"):
         assert unit in out
     assert "report.html" in out
+    assert sorted(planning._FILES) == FILES
+    assert all(is_ours(tmp_path / "out" / name) for name in FILES)
     assert "error" not in err
     assert (tmp_path / "out" / "plan.png").read_bytes()[:4] == b"\x89PNG"
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
@@ -379,11 +385,26 @@ def test_other_files_in_the_folder_stay(run: Run, scan: str, tmp_path: Path) -> 
     folder = tmp_path / "out"
     folder.mkdir()
     (folder / "notes.txt").write_text("mine")
-    (folder / "plan.json").write_text("old")
+    (folder / "plan.json").write_text(OLD)
     assert run("plan", scan, "--loads", 1, "--out", folder)[0] == 0
     assert sorted(path.name for path in folder.iterdir()) == sorted([*FILES, "notes.txt"])
     assert (folder / "notes.txt").read_text() == "mine"
-    assert json.loads((folder / "plan.json").read_text())["format"] == "wlplan.plan/1"
+    assert "loads" in json.loads((folder / "plan.json").read_text())
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("command", ["plan", "simulate"])
+def test_a_file_of_somebody_else_is_not_replaced(
+    run: Run, scan: str, tmp_path: Path, command: str, name: str
+) -> None:
+    """Nor is anything else written beside it; and that is told before anything is computed."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / name).write_text("mine")
+    words = (scan,) if command == "plan" else (scan, tmp_path / "none.json")
+    refused(run(command, *words, "--out", folder), name, "not from wlplan")
+    assert [path.name for path in folder.iterdir()] == [name]
+    assert (folder / name).read_text() == "mine"
 
 
 @pytest.mark.parametrize("exists", [False, True])
@@ -402,7 +423,7 @@ def test_a_run_that_is_cut_short_leaves_nothing(
     folder = tmp_path / "out"
     if exists:
         folder.mkdir()
-        (folder / "plan.json").write_text("old")
+        (folder / "plan.json").write_text(OLD)
 
     def write_report(*_: object, **__: object) -> None:
         raise stop
@@ -414,7 +435,7 @@ def test_a_run_that_is_cut_short_leaves_nothing(
     assert err.splitlines()[-1].startswith("error: ")
     if exists:
         assert [path.name for path in folder.iterdir()] == ["plan.json"]
-        assert (folder / "plan.json").read_text() == "old"
+        assert (folder / "plan.json").read_text() == OLD
     else:
         assert not folder.exists()
         assert sorted(path.name for path in tmp_path.iterdir()) == ["scan.npz"]

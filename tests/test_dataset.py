@@ -633,13 +633,22 @@ def test_a_lock_that_is_not_signed_yet_is_left_alone(copy: Path) -> None:
     assert lock.exists()
 
 
-@pytest.mark.parametrize("holder", ["", "99999999 1 {host}", "{pid} 1 {host}", "nonsense"])
+@pytest.mark.parametrize("holder", ["", "99999999 1 {host}", "{pid} 1 {host}"])
 def test_the_lock_of_a_dead_process_is_taken_over(copy: Path, holder: str) -> None:
     lock = copy.with_name("copy.zarr.lock")
     lock.write_text(holder.format(pid=os.getpid(), host=socket.gethostname()))
     os.utime(lock, (0.0, 0.0))
     collect(copy, cycles=CYCLES, seed=SEED)
     assert not lock.exists()
+
+
+def test_a_file_that_is_no_lock_of_ours_is_left_alone(tmp_path: Path) -> None:
+    """As the one of a package manager would be, beside a data set of its name."""
+    theirs = tmp_path / "poetry.lock"
+    theirs.write_text("# generated\n[[package]]\n")
+    refused(lambda: collect(tmp_path / "poetry", cycles=3), "no lock of wlplan")
+    assert theirs.read_text() == "# generated\n[[package]]\n"
+    assert list(tmp_path.iterdir()) == [theirs]
 
 
 def test_a_full_disk_is_said_in_one_line_and_costs_nothing(

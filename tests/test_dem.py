@@ -590,6 +590,17 @@ def test_the_worker_is_of_this_package_whatever_its_python_has(
         process.run_job({"kind": "bed"}, {}, timeout=60.0)
 
 
+def test_the_worker_imports_nothing_from_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("json", "numpy", "dataclasses", "importlib", "wlplan", "sitecustomize"):
+        (tmp_path / f"{name}.py").write_text("open('executed', 'w').close()\nraise SystemExit(3)\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="'settings'"):
+        process.run_job({"kind": "bed"}, {}, timeout=60.0)
+    assert not (tmp_path / "executed").exists()
+
+
 def test_a_cache_that_cannot_be_made_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

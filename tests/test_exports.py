@@ -15,6 +15,7 @@ from PIL import Image
 
 from wlplan.errors import InputError
 from wlplan.io import read_pile
+from wlplan.io.files import is_ours
 from wlplan.report import exports
 from wlplan.report.exports import Played, check, exported
 from wlplan.types import Pile
@@ -38,6 +39,14 @@ DOCUMENT: dict[str, Any] = {
 def played(document: dict[str, Any], pile: Pile) -> Played:
     heights = np.stack([np.asarray(pile.height) - 0.1, np.asarray(pile.height)])
     return Played(document, pile, heights)
+
+
+@pytest.mark.parametrize("kind", exports.KINDS)
+def test_a_file_says_who_has_written_it(tmp_path: Path, kind: str) -> None:
+    ((name, content),) = exported([kind], played(DOCUMENT, cone())).items()
+    assert exports.names([kind]) == [name]
+    (tmp_path / name).write_bytes(content)
+    assert is_ours(tmp_path / name)
 
 
 def test_a_film_has_a_picture_before_each_load_and_one_of_the_end() -> None:

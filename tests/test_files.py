@@ -9,7 +9,7 @@ from typing import Any, Literal
 import pytest
 
 from wlplan.io import files
-from wlplan.io.files import atomic_folder
+from wlplan.io.files import MADE_BY, atomic_folder, is_ours
 
 Existing = Literal["refuse", "replace", "add"]
 
@@ -303,3 +303,31 @@ def test_a_file_that_cannot_be_replaced_is_as_it_was(
     assert contents(target) == OLD
     files.replace_file(target / "a.txt", b"new")
     assert contents(target) == OLD | {"a.txt": "new"}
+
+
+# --- whose a file is
+
+
+@pytest.mark.parametrize(
+    ("content", "ours"),
+    [
+        (f"<meta content='{MADE_BY}'>", True),
+        (f"{'x' * 200_000}{MADE_BY}", True),
+        (f"{'x' * 200_000}{MADE_BY}{'x' * 200_000}", False),
+        ('{\n  "format": "wlplan.plan/1",', True),
+        ('{"format": "another"}', False),
+        ("how wlplan plans", False),
+        ("", False),
+    ],
+)
+def test_a_file_of_ours_says_so(tmp_path: Path, content: str, ours: bool) -> None:
+    path = tmp_path / "a"
+    path.write_text(content)
+    assert is_ours(path) is ours
+
+
+def test_what_is_no_file_is_not_ours(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("nowhere")
+    for name in ("pipe", "link", "none", "."):
+        assert not is_ours(tmp_path / name)

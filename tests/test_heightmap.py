@@ -112,6 +112,17 @@ def test_writing_back_keeps_the_volume_of_losses_and_gains(heading: float) -> No
     )
 
 
+def test_a_batch_of_changes_at_one_pose_keeps_the_volume_of_each() -> None:
+    pile = Pile(jnp.ones((96, 96)), 0.1)
+    p = pose(5.0, 5.0, 0.0)
+    changes = jnp.abs(jnp.asarray(np.random.default_rng(0).normal(size=(4, 52, 52)), jnp.float32))
+    many = jax.jit(jax.vmap(lambda change: add_local_change(pile.height, pile, p, change, 1.0)[0]))
+    for sign in (-0.01, 0.1):
+        moved = np.asarray(many(sign * changes) - 1.0, np.float64).sum(axis=(1, 2))
+        wanted = np.asarray(sign * changes, np.float64).sum(axis=(1, 2))
+        np.testing.assert_allclose(moved, wanted, rtol=1e-4)
+
+
 def test_writing_back_a_change_puts_it_where_it_belongs() -> None:
     pile = Pile(jnp.ones((120, 110)), 0.1)
     p = pose(5.5, 5.2, 0.6)

@@ -3,7 +3,9 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from laws import assert_gradient, assert_volume_kept
+from laws import assert_gradient, assert_no_soil_from_nowhere, assert_volume_kept
+
+from wlplan.types import Pile
 
 
 def test_the_volume_check_can_fail() -> None:
@@ -33,3 +35,17 @@ def test_the_gradient_check_counts_kinks() -> None:
         assert assert_gradient(lambda x: jnp.abs(x).sum(), jnp.asarray([0.0, 1.0]), skip=1) == 1
         with pytest.raises(AssertionError, match="differ"):
             assert_gradient(lambda x: jnp.abs(x).sum(), jnp.asarray([0.0, 1.0]))
+
+
+@pytest.mark.parametrize(
+    ("mass", "height", "told"),
+    [(-1.0, 1.0, "mass of -1"), (0.1, 1.0, "left the pile"), (0.2, -0.1, "below its floor")],
+)
+def test_the_check_on_soil_from_nowhere_can_fail(mass: float, height: float, told: str) -> None:
+    before = Pile(jnp.ones((10, 10)), 0.1)
+    after = before.replace(height=before.height.at[:].set(1.0 - 0.2).at[0, 0].set(height))
+    density = 0.2 / float((before.height - after.height).sum() * 0.01)
+    with pytest.raises(AssertionError, match=told):
+        assert_no_soil_from_nowhere(before, after, mass, density=density)
+    plain = before.replace(height=before.height - 0.2)
+    assert_no_soil_from_nowhere(before, plain, 0.2, density=1.0)

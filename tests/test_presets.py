@@ -165,7 +165,7 @@ def test_a_soil_may_rest_at_another_angle(write: Callable[..., Path]) -> None:
 
 def test_the_ends_of_a_range_count_as_inside(write: Callable[..., Path]) -> None:
     assert math.degrees(soil_named(write("friction_deg = 60")).friction) == pytest.approx(60.0)
-    assert machine_named(write("bucket_width = 5.2")).bucket_width == 5.2
+    assert machine_named(write("bucket_width = 4.6")).bucket_width == 4.6
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_nonsense_in_a_soil_file_is_refused_by_name(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("bucket_width = 5.3", ["bucket_width is 5.3 m", "0.5 to 5.2 m"]),
+        ("bucket_width = 4.7", ["bucket_width is 4.7 m", "0.5 to 4.6 m"]),
         ("bucket_width = false", ["bucket_width is False"]),
         ("mass = -15000", ["mass is -15000 kg"]),
         ("travel_speed = 8.0", ["travel_speed is 8 m/s", "1 to 5 m/s"]),
@@ -322,7 +322,7 @@ def test_a_narrower_bucket_loads_less(loaded: Callable[..., float]) -> None:
 
 @pytest.mark.slow
 def test_the_widest_bucket_that_is_let_pass_digs(loaded: Callable[..., float]) -> None:
-    widest = dataclasses.replace(WA320, bucket_width=parameters.MAP_WIDTH)
+    widest = dataclasses.replace(WA320, bucket_width=ranges_of(WheelLoader)["bucket_width"].high)
     assert 0.0 < loaded(machine=widest) < 2.0 * loaded()
 
 

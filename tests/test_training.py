@@ -345,11 +345,18 @@ def test_saving_replaces_a_model_and_nothing_else(
     (other / "thesis.txt").write_text("keep me")
     refused(lambda: save_model(other, saved[1], {}), "not a model")
     refused(lambda: save_model(other / "thesis.txt", saved[1], {}), "is a file")
+    (other / "model.json").write_text('{"name": "their model"}')
+    refused(lambda: save_model(other, saved[1], {}), "thesis.txt")
+    (other / "thesis.txt").unlink()
+    refused(lambda: save_model(other, saved[1], {}), "not a model")
+    (copy / "thesis.txt").write_text("keep me")
+    refused(lambda: save_model(copy, saved[1], {}), "thesis.txt")
+    assert (copy / "thesis.txt").read_text() == "keep me"
+    assert (other / "model.json").read_text() == '{"name": "their model"}'
     (tmp_path / "file").write_text("")
     refused(lambda: save_model(tmp_path / "file" / "model", saved[1], {}), "is a file")
     save_model(tmp_path / "missing" / "folder" / "model", saved[1], {})
     load_model(tmp_path / "missing" / "folder" / "model")
-    assert (other / "thesis.txt").read_text() == "keep me"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["copy", "file", "missing", "other"]
 
 

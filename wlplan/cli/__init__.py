@@ -29,6 +29,7 @@ from wlplan.cli import (
     programs,
     serving,
 )
+from wlplan.cli.said import mend_streams, tell
 from wlplan.errors import InputError
 
 # Commands in which nothing is compiled.
@@ -83,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 0 done, 1 a fault of wlplan, 2 bad input or usage, 130 interrupted.
     """
+    mend_streams()
     if "_WLPLAN_COMPLETE" in os.environ:  # the shell asks for completions
         wlplan.main(prog_name="wlplan")
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -126,8 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _fail(message: str, code: int) -> int:
     text = " ".join(message.split())
-    with contextlib.suppress(OSError, ValueError):
-        print(f"error: {text if len(text) <= 600 else text[:597] + '...'}", file=sys.stderr)
+    tell(f"error: {text if len(text) <= 600 else text[:597] + '...'}")
     return code
 
 

@@ -10,6 +10,7 @@ import click
 from wlplan.cli.options import out_option, with_options
 from wlplan.cli.outputs import checked_folder, json_text, print_table, titled_table, write_files
 from wlplan.cli.progress import Progress
+from wlplan.cli.said import say
 
 # Names that `wlplan.studies.bench` defines, repeated here to keep help fast; a test compares them.
 ITEMS = (
@@ -54,7 +55,7 @@ def bench(names: tuple[str, ...], quick: bool, out: str | None, seed: int, as_js
 
     Compiling and running are timed separately. With --out: bench.json.
     """
-    folder = None if out is None else checked_folder(out)
+    folder = None if out is None else checked_folder(out, ["bench.json"])
 
     from wlplan.studies.bench import run_bench
 
@@ -68,7 +69,7 @@ def bench(names: tuple[str, ...], quick: bool, out: str | None, seed: int, as_js
         return
     _print_bench(document)
     if folder is not None:
-        print(f"written: {folder / 'bench.json'}")
+        say(f"written: {folder / 'bench.json'}")
 
 
 def _print_bench(document: Mapping[str, Any]) -> None:
@@ -102,7 +103,7 @@ def _print_bench(document: Mapping[str, Any]) -> None:
             end_section=after is None or after["group"] != record["group"],
         )
     print_table(table)
-    print("Targets are for two CPU cores. Times of others were measured elsewhere or published.")
+    say("Targets are for two CPU cores. Times of others were measured elsewhere or published.")
 
 
 def _duration(seconds: float) -> str:

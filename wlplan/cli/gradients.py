@@ -28,6 +28,8 @@ from wlplan.cli.options import (
 )
 from wlplan.cli.outputs import checked_folder, json_text, print_table, titled_table, write_files
 from wlplan.cli.progress import Progress, Stopwatch
+from wlplan.cli.said import say
+from wlplan.cli.values import FiniteRange
 from wlplan.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,14 +57,14 @@ _VERDICTS = {"ok": ("ok", None), "kink": ("kink", "yellow"), "wrong": ("WRONG", 
     objective_option("Cost of the plan"),
     click.option(
         "--step",
-        type=click.FloatRange(1e-9, 1e-3),
+        type=FiniteRange(1e-9, 1e-3),
         default=1e-6,
         show_default=True,
         help="Step of the differences, in m, rad or the unit of the action parameter.",
     ),
     click.option(
         "--tolerance",
-        type=click.FloatRange(1e-9, 1.0),
+        type=FiniteRange(1e-9, 1.0),
         default=None,
         help="Relative error above which a component counts as wrong. Default: 1e-4; in the "
         "simulator, where the derivative of the earthmoving force is approximate, 3e-3.",
@@ -101,7 +103,7 @@ def gradcheck(
             f"--loads {loads} takes too long in the simulator: ask for at most "
             f"{_MOST_LOADS_SIMULATOR}, or check another world."
         )
-    folder = None if out is None else checked_folder(out)
+    folder = None if out is None else checked_folder(out, ["gradcheck.json"])
 
     from wlplan.io import plan_to_dict
     from wlplan.planning.job import make_job
@@ -148,9 +150,9 @@ def gradcheck(
         click.echo(text)
     else:
         _print_check(check, f"{loads} loads from {named.fields['file']}, {world_name} world")
-        print(f"gradient and differences {checking.text()}")
+        say(f"gradient and differences {checking.text()}")
         if folder is not None:
-            print(f"written: {folder / 'gradcheck.json'}")
+            say(f"written: {folder / 'gradcheck.json'}")
     if check.with_verdict("wrong"):
         raise click.exceptions.Exit(1)
 
@@ -174,14 +176,14 @@ def _print_check(check: GradientCheck, title: str) -> None:
     print_table(table)
     kinks, wrong = check.with_verdict("kink"), check.with_verdict("wrong")
     count = len(check.components)
-    print(
+    say(
         f"{count} components: {count - len(kinks) - len(wrong)} ok, {len(kinks)} at kinks "
         f"({100.0 * check.kink_fraction:.1f} %), {len(wrong)} wrong"
     )
     for word, found in (("at kinks", kinks), ("WRONG", wrong)):
         if found:
-            print(f"{word}: {', '.join(f'load {c.load} {c.component}' for c in found)}")
-    print(
+            say(f"{word}: {', '.join(f'load {c.load} {c.component}' for c in found)}")
+    say(
         f"relative error, kinks left out: largest {check.largest_error:.1e}, "
         f"median {check.median_error:.1e}; tolerance {check.tolerance:g}"
     )

@@ -9,6 +9,7 @@ import click
 
 from wlplan.cli.options import BUNDLED, PileFile, pile_argument, with_options
 from wlplan.cli.outputs import json_text
+from wlplan.cli.said import say
 
 
 @click.command(
@@ -49,15 +50,15 @@ def _print(found: dict[str, Any], name: str, soil: str) -> None:
     """What was found, in words on stdout."""
     x0, y0, x1, y1 = found["extent"]
     nx, ny = found["cells"]
-    print(f"{name}: {nx} x {ny} cells of {found['cell_size']:g} m")
-    print(
+    say(f"{name}: {nx} x {ny} cells of {found['cell_size']:g} m")
+    say(
         f"from {x0:.1f}, {y0:.1f} to {x1:.1f}, {y1:.1f} m; reference system: "
         f"{found['crs'] or 'not named'}"
     )
     if found["unseen_area"]:
-        print(f"{found['unseen_area']:.1f} m² were not seen")
+        say(f"{found['unseen_area']:.1f} m² were not seen")
     parts = found["volume_deviation_parts"]
-    print(
+    say(
         f"volume {found['volume']:.1f} m³ ± {found['volume_deviation']:.1f} "
         f"(noise {parts['noise']:.1f}, floor {parts['floor']:.1f}, unseen {parts['unseen']:.1f}), "
         f"{found['tonnes']:.0f} t as {soil}"
@@ -66,19 +67,19 @@ def _print(found: dict[str, Any], name: str, soil: str) -> None:
         planned = (
             " (the one that is planned)" if pile["planned"] and len(found["piles"]) > 1 else ""
         )
-        print(
+        say(
             f"pile at {pile['x']:.1f}, {pile['y']:.1f}: {pile['volume']:.1f} m³ ± "
             f"{pile['volume_deviation']:.1f}, {pile['tonnes']:.0f} t, {pile['height']:.1f} m high, "
             f"{pile['area']:.0f} m², toe {pile['toe_length']:.0f} m{planned}"
         )
-    print(
+    say(
         f"slopes: median {found['median_slope_deg']:.0f}°, steepest "
         f"{found['steepest_slope_deg']:.0f}°; {soil} rests at {found['repose_deg']:.0f}°"
     )
     for one in found["structures"]:
-        print(
+        say(
             f"stands there: {one['kind']} {one['length']:.1f} x {one['width']:.1f} m, "
             f"{one['height']:.1f} m high, at {one['x']:.1f}, {one['y']:.1f}"
         )
     for note in found["notes"]:
-        print(f"note: {note}")
+        say(f"note: {note}")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wlplan.cli.options import BUNDLED, READING, PileFile
+from wlplan.cli.options import BUNDLED, READING, UPS, PileFile
 from wlplan.cli.outputs import remark
 from wlplan.errors import InputError
 from wlplan.planning import planners
@@ -104,6 +104,9 @@ def read_as_recorded(file: PileFile, record: object) -> PileFile:
     Args:
         file: As it was asked for.
         record: What the plan says about its pile. If that is another file, nothing is taken over.
+
+    Raises:
+        InputError: If an option that it records is of another kind.
     """
     if not isinstance(record, dict):
         return file
@@ -112,11 +115,45 @@ def read_as_recorded(file: PileFile, record: object) -> PileFile:
         for name, value in record.items()
         if name in READING and name not in file.reading
     }
+    for name, value in kept.items():
+        if not _RECORDED[name](value):
+            raise InputError(f"the pile of the plan has a {name} that is none: give --{name} anew.")
     if not kept or record.get("sha256") != checksum(_path_of(file)):
         return file
     options = ", ".join(f"--{name.replace('_', '-')}" for name in kept)
     remark(f"the pile is read as the plan was made, with its {options}")
     return PileFile(file.name, {**kept, **file.reading})
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _are_numbers(count: int) -> Callable[[object], bool]:
+    """Whether a value is so many numbers."""
+
+    def check(value: object) -> bool:
+        return isinstance(value, tuple) and len(value) == count and all(map(_is_number, value))
+
+    return check
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str)
+
+
+# What a plan may record of how its pile was read, by the option.
+_RECORDED: dict[str, Callable[[object], bool]] = {
+    "band": lambda value: isinstance(value, int) and _is_number(value),
+    "crop": _are_numbers(4),
+    "layer": _is_name,
+    "up": lambda value: value in UPS,
+    "ground": lambda value: _is_name(value) or _is_number(value),
+    "pile": _are_numbers(2),
+    "keep_out": _is_name,
+    "truck_area": _is_name,
+    "include": _are_numbers(2),
+}
 
 
 def _path_of(file: PileFile) -> Path:

@@ -6,6 +6,7 @@ import click
 
 from wlplan.cli.options import with_options
 from wlplan.cli.outputs import json_text
+from wlplan.cli.said import say
 
 
 @click.command(
@@ -39,11 +40,11 @@ def cache(is_to_clear: bool, seed: int, as_json: bool) -> None:
         click.echo(json_text(fields))
         return
     if cleared is not None:
-        print(f"removed {cleared} files")
+        say(f"removed {cleared} files")
     if found.folder is None:
-        print(f"programs are not kept: {found.reason}")
+        say(f"programs are not kept: {found.reason}")
         return
-    print(f"{len(files)} programs, {size / 1e6:.1f} MB, in {found.folder}")
+    say(f"{len(files)} programs, {size / 1e6:.1f} MB, in {found.folder}")
     for name, value in programs.made_with().items():
         if value:
-            print(f"  {name}: {value}")
+            say(f"  {name}: {value}")

@@ -22,6 +22,7 @@ from wlplan.cli.inputs import check_is_folder, site_named
 from wlplan.cli.options import PROTOCOLS, site_options, training_options, with_options
 from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.progress import Progress, Stopwatch
+from wlplan.cli.said import say
 from wlplan.cli.values import ShardNumber
 from wlplan.errors import InputError
 from wlplan.training.settings import KINDS
@@ -117,7 +118,7 @@ def collect(
         click.echo(json_text({"out": out, "cycles": cycles, "seed": seed, **part}))
         return
     which = "" if shard is None else f"shard {shard[0]}/{shard[1]} of "
-    print(f"{which}{cycles} cycles in {out}; {_pace(counts)}")
+    say(f"{which}{cycles} cycles in {out}; {_pace(counts)}")
 
 
 def _pace(counts: Sequence[tuple[int, float]]) -> str:
@@ -159,7 +160,7 @@ def _merge(parts: Sequence[str], out: str, as_json: bool) -> None:
     if as_json:
         click.echo(json_text({"out": out, "cycles": cycles, "seed": seed, "merged": list(parts)}))
         return
-    print(f"{cycles} cycles of {len(parts)} {'shard' if len(parts) == 1 else 'shards'} in {out}")
+    say(f"{cycles} cycles of {len(parts)} {'shard' if len(parts) == 1 else 'shards'} in {out}")
 
 
 # Kinds of the models that predict the pile state.
@@ -240,8 +241,8 @@ def train(
         return
     title = f"{model}, held-out part of {', '.join(data)}"
     _print_report(kind, title, report.as_dict())
-    print(f"training {training.text()}")
-    print(f"written: {out}")
+    say(f"training {training.text()}")
+    say(f"written: {out}")
 
 
 def _print_report(kind: str, title: str, report: Mapping[str, Any]) -> None:
@@ -271,14 +272,14 @@ def _train_all(data: str, out: str, *, epochs: int | None, seed: int, as_json: b
     for kind, report in reports.items():
         title = f"{kind.replace('_', '-')}, held-out parts of {data} and those beside it"
         _print_report(kind, title, report)
-    print(f"collecting and training {work.text()}")
+    say(f"collecting and training {work.text()}")
     for trained, words in (
         (True, "written"),
         (False, "kept, since data, settings and versions are the same"),
     ):
         places = [str(Path(out) / kind) for kind in reports if (kind in stages) is trained]
         if places:
-            print(f"{words}: {', '.join(places)}")
+            say(f"{words}: {', '.join(places)}")
 
 
 @click.command(
@@ -314,7 +315,7 @@ def evaluate(data: str, model: str | None, seed: int, as_json: bool) -> None:
     part = held_out(dataset, description)
     # What was held out of its own data has piles that are new to it.
     if part is dataset and shares_piles(dataset, description):
-        seed_of = dataset.attributes["seed"]
+        seed_of = dataset.attributes.get("seed")
         remark(
             f"{data} has seed {seed_of}, as a data set of the model's training: the model has seen "
             f"some of these piles, and its errors on them are smaller. Collect with another seed."

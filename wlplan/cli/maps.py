@@ -33,10 +33,12 @@ from wlplan.cli.outputs import (
     write_files,
 )
 from wlplan.cli.progress import Progress, Stopwatch, ready
+from wlplan.cli.said import say
 from wlplan.cli.values import ActionNumbers
 from wlplan.constants import QUANTITIES
 
 _FORMAT = "wlplan.diggability/1"
+_FILES = ("report.html", "diggability.png", "diggability.json")
 _MOST_LOCATIONS = 10_000
 
 
@@ -87,7 +89,7 @@ def diggability(
     check_pile_name(pile_file.name)
     check_models(model, pile_state, world_name)
     site = site_named(soil, machine)
-    folder = None if out is None else checked_folder(out)
+    folder = None if out is None else checked_folder(out, _FILES)
 
     import numpy as np
 
@@ -146,14 +148,11 @@ def diggability(
     text = json_text(document)
     if folder is not None:
         from wlplan.report import figures as plots
-        from wlplan.report.diggability_page import REPORT_NAME, render_map
+        from wlplan.report.diggability_page import render_map
 
         png = plots.png_bytes(plots.diggability_figure(pile, found, frame=named.frame))
         page = render_map(document, pile, settings={"map, wall clock": mapping.text()})
-        write_files(
-            folder,
-            {REPORT_NAME: page, "diggability.png": png, "diggability.json": f"{text}\n"},
-        )
+        write_files(folder, dict(zip(_FILES, (page, png, f"{text}\n"), strict=True)))
     for note in document["notes"]:
         remark(note)
     if as_json:
@@ -171,6 +170,6 @@ def diggability(
             f"{math.degrees(records['heading'][best]):.0f}",
         )
     print_table(table)
-    print(f"map {mapping.text()}")
+    say(f"map {mapping.text()}")
     if folder is not None:
-        print(f"written: {folder / REPORT_NAME}, and diggability.png, diggability.json beside it")
+        say(f"written: {folder / _FILES[0]}, and {', '.join(_FILES[1:])} beside it")

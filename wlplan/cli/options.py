@@ -9,7 +9,14 @@ from typing import Any, cast
 
 import click
 
-from wlplan.cli.values import LevelOrFile, NameOrReference, Numbers, PlaceOrAuto, WholeNumbers
+from wlplan.cli.values import (
+    FiniteRange,
+    LevelOrFile,
+    NameOrReference,
+    Numbers,
+    PlaceOrAuto,
+    WholeNumbers,
+)
 from wlplan.cli.verbosity import quiet_or_verbose
 from wlplan.planning import planners
 from wlplan.planning.objectives import OBJECTIVES
@@ -98,7 +105,7 @@ def _option_type(setting: Setting, default: Any) -> Any:
     high = setting.most if setting.below is None else setting.below
     opens = {"min_open": setting.above is not None, "max_open": setting.below is not None}
     if isinstance(default, float):
-        return click.FloatRange(low, high, **opens)
+        return FiniteRange(low, high, **opens)
     # The bounds of a whole number are whole numbers.
     return click.IntRange(cast("int | None", low), cast("int | None", high), **opens)
 

@@ -2,31 +2,45 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import secrets
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
+from wlplan.cli.said import tell
 from wlplan.cli.verbosity import is_asked
-from wlplan.errors import InputError, one_line
+from wlplan.errors import InputError, one_line, shown
 
 
-def checked_folder(name: str) -> Path:
+def checked_folder(name: str, files: Iterable[str] = ()) -> Path:
     """A folder to write to, found out to be possible before anything long is begun.
 
+    Args:
+        name: Path of the folder.
+        files: Names of the files that are to be written into it.
+
     Raises:
-        InputError: If it is a file, below one, or cannot be written.
+        InputError: If it is a file, below one, or cannot be written; or one of the files is there
+            and not from us.
     """
+    from wlplan.io.files import is_ours
+
     if not name.strip():
         raise InputError("the name of the folder to write to is empty: give one.")
     if os.path.lexists(name) and not os.path.isdir(name):
         raise InputError(f"{name}: is a file: name a folder to write to.")
     folder = Path(name)
+    for file in files:
+        if os.path.lexists(folder / file) and not is_ours(folder / file):
+            raise InputError(
+                f"{folder / file}: is there and not from wlplan: name another folder, or move it."
+            )
     place = folder.absolute()
     while not os.path.lexists(place):
         place = place.parent
@@ -79,7 +93,7 @@ def json_text(document: Mapping[str, Any]) -> str:
 def remark(text: str) -> None:
     """Print on stderr what is worth knowing but no error."""
     if not is_asked("quiet"):
-        print(f"note: {text}", file=sys.stderr)
+        tell(f"note: {text}")
 
 
 def titled_table(title: str) -> Any:
@@ -88,7 +102,7 @@ def titled_table(title: str) -> Any:
     from rich.table import Table
 
     return Table(
-        title=title,
+        title=shown(title),
         title_justify="left",
         title_style="bold",
         box=box.SIMPLE_HEAD,
@@ -103,10 +117,15 @@ def print_table(table: Any) -> None:
 
     # A file or a pipe has no width of its own: take what the table needs.
     width = None if sys.stdout.isatty() else 140
-    # Units stand in square brackets, which would count as markup.
-    Console(width=width, highlight=False, markup=False).print(table)
+    # Units stand in square brackets, which would count as markup. On a stream whose reader has gone
+    # the library would end the process by itself.
+    buffer, terminal = io.StringIO(), sys.stdout.isatty()
+    Console(file=buffer, force_terminal=terminal, width=width, highlight=False, markup=False).print(
+        table
+    )
+    sys.stdout.write(buffer.getvalue())
 
 
 def print_bold(text: str) -> None:
     """Print on stdout what is to be seen first, bold where there is a terminal."""
-    print(click.style(text, bold=True) if sys.stdout.isatty() else text)
+    print(click.style(shown(text), bold=True) if sys.stdout.isatty() else shown(text))

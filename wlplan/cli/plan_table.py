@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from wlplan.cli.outputs import print_bold, print_table, remark, titled_table
+from wlplan.cli.said import say
 from wlplan.constants import QUANTITIES
 from wlplan.report.headline import headline, trucks_said
 from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error
@@ -69,28 +70,28 @@ def print_plan(document: Mapping[str, Any]) -> None:
 
     print_bold(_job(headline(document)))
     for line in trucks_said(document):
-        print(line)
+        say(line)
     for q, (title, unit, _) in QUANTITIES.items():
         simulated = total["simulated"][q]
         if predicted and simulated:
             off = 100.0 * (predicted[q] / simulated - 1.0)
-            print(
+            say(
                 f"{title}: predicted {predicted[q]:.1f} {unit}, simulated {simulated:.1f} {unit}, "
                 f"difference {off:+.1f} %"
             )
     for who, stand in stands_of(document):
         where, into = frame.place(stand["x"], stand["y"]), math.degrees(stand["heading"])
-        print(f"{who}: the loader dumps at {where}, heading {into:.0f}°")
+        say(f"{who}: the loader dumps at {where}, heading {into:.0f}°")
     costs = [f"{part} {total[part]['cost']:.3f}" for part in total if "cost" in total[part]]
-    print(f"cost for {document['objective']}: {', '.join(costs)}")
+    say(f"cost for {document['objective']}: {', '.join(costs)}")
     lost = ledger["volume_before"] - ledger["volume_after"]
-    print(
+    say(
         f"ledger: {ledger['volume_before']:.2f} m³ before, {ledger['volume_after']:.2f} m³ after; "
         f"{lost:.3f} m³ at {ledger['density']:.3f} t/m³ for {ledger['mass_removed']:.3f} t loaded"
     )
     solves = ledger.get("solves")
     if solves:
-        print(
+        say(
             f"avalanches: at most {solves['most_rounds']} rounds, steepest slope left "
             f"{solves['steepest_slope_deg']:.1f}°"
         )

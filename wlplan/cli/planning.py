@@ -41,16 +41,20 @@ from wlplan.cli.outputs import checked_folder, json_text, remark
 from wlplan.cli.plan_table import print_plan, remark_on_ledger
 from wlplan.cli.programs import cache_of_command
 from wlplan.cli.progress import Progress, Stopwatch, ready
+from wlplan.cli.said import say
 from wlplan.constants import QUANTITIES
 from wlplan.errors import InputError
 from wlplan.planning.objectives import OBJECTIVES
 from wlplan.report.exports import check as check_exports
+from wlplan.report.exports import names as names_of_exports
 
 if TYPE_CHECKING:
     from wlplan.planning.amounts import Amount
     from wlplan.site.frame import Frame
     from wlplan.types import Performance
 
+# Files that a plan is written as, apart from exports; a test compares them.
+_FILES = ("plan.json", "plan.png", "totals.png", "report.html")
 # Exit code after Ctrl-C, also if there was a plan to show.
 _INTERRUPTED = 130
 # What a plan says about where it comes from; kept when it is played again.
@@ -169,7 +173,7 @@ def plan(
         click.echo(text)
     else:
         print_plan(document)
-        print("; ".join(f"{name} {text}" for name, text in seconds.items()))
+        say("; ".join(f"{name} {text}" for name, text in seconds.items()))
         _print_written(folder, written)
     if made.planned.stopped == "interrupted":
         raise click.exceptions.Exit(_INTERRUPTED)
@@ -184,15 +188,15 @@ def _folder_of(out: str | None, also: Sequence[str]) -> Path | None:
     if also and out is None:
         raise InputError("--also needs a folder to write to: give --out DIR.")
     check_exports(also)
-    return None if out is None else checked_folder(out)
+    return None if out is None else checked_folder(out, [*_FILES, *names_of_exports(also)])
 
 
 def _print_written(folder: Path | None, written: list[str] | None) -> None:
     if folder is None or written is None:
-        print("nothing written: --out DIR writes the plan, the figures and a report")
+        say("nothing written: --out DIR writes the plan, the figures and a report")
         return
     first, *others = written
-    print(f"written: {folder / first}, and {', '.join(others)} beside it")
+    say(f"written: {folder / first}, and {', '.join(others)} beside it")
 
 
 @click.command(
@@ -265,7 +269,8 @@ def simulate(
     )
     objective = given.get("objective")
     # A plan file must not make us import somebody else's module.
-    objective = objective if objective in OBJECTIVES else next(iter(OBJECTIVES))
+    if not isinstance(objective, str) or objective not in OBJECTIVES:
+        objective = next(iter(OBJECTIVES))
     places = None if truck is not None else _places_of_trucks(given, frame)
     if places is None:
         place = site.with_receiver(
@@ -342,7 +347,7 @@ def simulate(
         click.echo(text)
         return
     print_plan(document)
-    print(f"{engine} {playing.text()}")
+    say(f"{engine} {playing.text()}")
     _print_written(folder, written)
 
 

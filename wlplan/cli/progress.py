@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from wlplan.cli.said import tell
 from wlplan.cli.verbosity import is_asked
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ class Progress:
         """Say what begins."""
         now = time.monotonic()
         if self._verbose and self._phase:
-            print(f"{self._phase}: {now - self._since:.1f} s", file=sys.stderr, flush=True)
+            tell(f"{self._phase}: {now - self._since:.1f} s")
         self._phase, self._since = text, now
 
     def now(self) -> str:
@@ -109,7 +110,7 @@ class Progress:
             return
         self._told[stage] = now
         line = ", ".join(filter(None, (f"{stage} {done}/{total}", text, pace)))
-        print(line, file=sys.stderr, flush=True)
+        tell(line)
 
     def _tell_now_and_then(self) -> None:
         """A line whenever nothing was told for a while."""
@@ -117,7 +118,7 @@ class Progress:
             # A copy: the other thread adds stages meanwhile.
             quiet = all(time.monotonic() - told > _PAUSE for told in tuple(self._told.values()))
             if quiet and self._phase and not self._done.is_set():
-                print(self.now(), file=sys.stderr, flush=True)
+                tell(self.now())
 
     def _pace(self, stage: str, done: int, total: int, now: float) -> str:
         """How many a second, and how long it will still take; nothing while that is not known."""
@@ -157,7 +158,7 @@ def _on_duration(event: str, duration_secs: float, **labels: str | int) -> None:
         _compilations.append((now - duration_secs, now))
         if event == _COMPILED and duration_secs > _QUICK and is_asked("verbose"):
             name = labels.get("fun_name", "a program")
-            print(f"compiled {name}: {duration_secs:.1f} s", file=sys.stderr, flush=True)
+            tell(f"compiled {name}: {duration_secs:.1f} s")
 
 
 def listen() -> None:

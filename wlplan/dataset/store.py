@@ -7,6 +7,7 @@ import dataclasses
 import itertools
 import json
 import os
+import re
 import socket
 import time
 import warnings
@@ -20,6 +21,7 @@ from wlplan.dataset.layout import Layout
 from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, h36_after
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError, one_line
+from wlplan.io.documents import check_kinds, parse_json
 from wlplan.io.files import atomic_folder, replace_file
 from wlplan.io.provenance import command, versions
 
@@ -28,6 +30,14 @@ DATASET_FORMAT = "wlplan.dataset/1"
 SHARD_ATTRIBUTES = ("shard", "shards", "first_cycle", "whole_cycles")
 """Attributes that a shard has and a whole data set has not."""
 
+# What attributes are that are looked at; a number of them may be missing in older data sets.
+_KINDS: dict[str, type] = {
+    **dict.fromkeys((*SHARD_ATTRIBUTES, "cycles", "cycles_done", "seed", "loads"), int),
+    **dict.fromkeys(("soil", "machine", "settings", "schedule", "versions"), dict),
+    "protocol": str,
+}
+# How a lock is signed: number and start of the process, and its host.
+_SIGNED = re.compile(r"\d+ \S+ .*")
 # A lock that is empty for longer was left by a process that died before it signed it [s].
 _SIGNING_TIME = 10.0
 
@@ -178,12 +188,13 @@ def read_attributes(path: Path) -> dict[str, Any]:
     if not os.path.lexists(path):
         raise InputError(f"{path}: no such data set: check the name, or collect it first.")
     try:
-        attributes: dict[str, Any] = json.loads((path / "zarr.json").read_text("utf-8"))[
-            "attributes"
-        ]
+        attributes: dict[str, Any] = parse_json((path / "zarr.json").read_bytes())["attributes"]
         found = attributes.get("format")
         if found == DATASET_FORMAT:
-            int(attributes["cycles"]), int(attributes["cycles_done"])
+            check_kinds(attributes, _KINDS)
+            check_kinds(attributes.get("soil", {}), {"density": (int, float)})
+            if not 0 <= attributes["cycles_done"] <= attributes["cycles"]:
+                raise ValueError("more cycles than it has room for")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{path}: is not a data set of wlplan: name a directory that `wlplan collect` wrote."
@@ -217,11 +228,15 @@ def lock(path: Path) -> Iterator[None]:
     mine = f"{os.getpid()} {_start_of(os.getpid())} {socket.gethostname()}"
     for attempt in itertools.count():
         try:
-            handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+            handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
         except FileExistsError:
             holder = ""
             with contextlib.suppress(OSError):
                 holder = lock.read_text("utf-8")
+            if holder and not _SIGNED.fullmatch(holder):
+                raise InputError(
+                    f"{path}: {lock.name} is beside it and no lock of wlplan: choose another name."
+                ) from None
             if _is_alive(holder) or (not holder and _is_young(lock)) or attempt > 2:
                 raise InputError(
                     f"{path}: is being written by process {holder.split(' ')[0] or '?'}: wait for "
@@ -305,6 +320,8 @@ def open_dataset(path: str | os.PathLike[str]) -> Dataset:
             array = group[name]
             if not isinstance(array, zarr.Array) or array.nchunks_initialized < array.nchunks:
                 raise ValueError(f"parts of {name} are missing")
+            if not np.can_cast(array.dtype, variable.dtype, "same_kind"):
+                raise ValueError(f"{name} is of type {array.dtype}")
             columns[name] = np.asarray(array[...])
             if columns[name].shape != (cycles, *variable.shape):
                 raise ValueError(f"{name} has shape {columns[name].shape}")

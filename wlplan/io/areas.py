@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from wlplan.errors import InputError, one_line
+from wlplan.io.documents import parse_json
 from wlplan.io.files import check_is_file, named
 
 KINDS = ("obstacle", "no-go", "no-dig")
@@ -75,11 +75,13 @@ def read_areas(path: Path, kinds: tuple[str, ...] = KINDS) -> tuple[Area, ...]:
     check_is_file(path, "GeoJSON")
     with named(path):
         try:
-            document = json.loads(path.read_bytes().decode())
-        except (OSError, ValueError, RecursionError) as error:
+            document = parse_json(path.read_bytes())
+        except OSError as error:
             raise InputError(
-                f"is not GeoJSON ({one_line(error)}): export the areas as GeoJSON."
+                f"cannot be read ({one_line(error.strerror or error)}): check the file."
             ) from error
+        except InputError as error:
+            raise InputError(f"is not GeoJSON: it {error}") from error
         features = document.get("features") if isinstance(document, dict) else None
         if features is None and isinstance(document, dict):
             features = [document if "geometry" in document else {"geometry": document}]
@@ -96,7 +98,7 @@ def _areas(feature: Any, kinds: tuple[str, ...]) -> list[Area]:
     properties = feature.get("properties") if isinstance(feature, dict) else None
     properties = properties if isinstance(properties, dict) else {}
     kind = properties.get("kind", kinds[0])
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         raise InputError(
             f"has an area of kind {one_line(repr(kind))}: use one of {', '.join(kinds)}."
         )

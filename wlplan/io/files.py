@@ -8,11 +8,15 @@ import os
 import re
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 from wlplan.errors import InputError, one_line
+
+# Windows would else change the ends of lines.
+_BINARY = getattr(os, "O_BINARY", 0)
 
 
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
@@ -42,10 +46,13 @@ def replace_file(path: Path, content: bytes) -> None:
     """
     temporary = _temporary(path)
     try:
-        with temporary.open("xb") as file:
+        # Nobody else reads or changes it before it is whole.
+        handle = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY | _BINARY, 0o600)
+        with os.fdopen(handle, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
+        temporary.chmod(0o666 & ~_mask())
         os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError):
@@ -99,8 +106,9 @@ def atomic_folder(
         # Files are added from inside the folder: it may be all that can be written to.
         temporary = _temporary(place / place.name if adds else place)
         try:
-            temporary.mkdir()
+            temporary.mkdir(0o700)
             yield temporary
+            temporary.chmod(0o777 & ~_mask())
             if adds:
                 _move_files(temporary, place)
             elif existing == "replace" and place.is_dir():
@@ -185,6 +193,14 @@ def _remove_folder(folder: Path) -> None:
         raise
 
 
+def _mask() -> int:
+    """Permissions that the user wants no new file to have."""
+    # It can only be read by being set: to what is harmless for the files of other threads.
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
+
+
 def _temporary(path: Path) -> Path:
     """A hidden name beside a path that nothing has yet."""
     return path.parent / f".{path.name or 'wlplan'}.{secrets.token_hex(6)}.tmp"
@@ -200,6 +216,29 @@ def _remove_leftovers(place: Path) -> None:
             _remove_folder(entry)
 
 
+MADE_BY = "made by wlplan"
+"""What every file that is no JSON says in its head or tail, so that we know it for ours."""
+
+# What says so in JSON, and how much of a file is looked at from either end.
+_FORMAT = re.compile(rb'"format":\s*"wlplan\.')
+_ENDS = 1 << 16
+
+
+def is_ours(path: Path) -> bool:
+    """Whether a file says that wlplan has written it; no for what cannot be read."""
+    try:
+        # A pipe would have to be waited for.
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            return False
+        with path.open("rb") as file:
+            ends = [file.read(_ENDS)]
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _ENDS))
+            ends.append(file.read(_ENDS))
+    except OSError:
+        return False
+    return any(MADE_BY.encode() in end or _FORMAT.search(end) for end in ends)
+
+
 def check_is_file(path: Path, what: str) -> None:
     """Refuse a path that is missing or a folder; `what` says what kind of file it should be."""
     # Unlike Path.exists, these take names that no file can have for missing ones.
@@ -207,6 +246,9 @@ def check_is_file(path: Path, what: str) -> None:
         raise InputError(f"{path}: is a folder: name the {what} file itself.")
     if not os.path.exists(path):
         raise InputError(f"{path}: no such {what} file: check the name.")
+    # Some of them never end. A pipe does, and may be how a file is given.
+    if stat.S_ISCHR(kind := os.stat(path).st_mode) or stat.S_ISBLK(kind):
+        raise InputError(f"{path}: is a device: name a {what} file.")
 
 
 @contextlib.contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from jaxtyping import Array
 
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.errors import InputError, one_line
+from wlplan.io.documents import parse_json
 from wlplan.io.files import check_is_file, named, write_text_atomic
 from wlplan.types import Action, LoadingPlan, Performance, Pose
 from wlplan.xla import floats
@@ -115,12 +115,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[LoadingPlan, dict[str, Any]
 
 
 def _parse_plan(text: str) -> tuple[LoadingPlan, dict[str, Any]]:
-    try:
-        document = json.loads(text, parse_float=_finite, parse_constant=_finite)
-    except InputError:
-        raise
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"is not valid JSON ({one_line(error)}): write the plan again.") from error
+    document = parse_json(text)
     found = document.get("format") if isinstance(document, dict) else None
     if found != PLAN_FORMAT:
         raise InputError(
@@ -187,11 +182,3 @@ def _number(record: Any, name: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e30:
         raise InputError(f"{where}: `{name}` is {one_line(repr(value))}, not a finite number.")
     return float(value)
-
-
-def _finite(text: str) -> float:
-    """Refuse NaN, infinity and numbers too large, which Python's JSON reader lets through."""
-    value = float(text)
-    if not math.isfinite(value):
-        raise InputError(f"holds {one_line(text)}: every number of a plan has to be finite.")
-    return value

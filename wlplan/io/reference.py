@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
+import re
+import warnings
+from collections.abc import Iterator
 from typing import Any
 
 from wlplan.errors import InputError
@@ -13,6 +17,9 @@ METRE = 1.0
 # Largest part by which a metre of a map may differ from one on the ground. UTM, state planes and
 # the grids of countries stay below a thousandth; Web Mercator is 1.5 times too large at 48 degrees.
 _MOST_DISTORTION = 0.01
+_EPSG = re.compile(r"(?:EPSG:)?(\d{1,9})", re.IGNORECASE)
+# Parameters of PROJ that name files; `@null` is none.
+_FILES = re.compile(r"\+(\w*grids|init|file)=(?!@null\b)", re.IGNORECASE)
 # How units are written in files, besides the names of the EPSG registry, in lower case.
 _SPELLINGS = {
     **dict.fromkeys(("m", "meter", "meters", "metres"), "metre"),
@@ -104,16 +111,20 @@ def reference_of(
     """What a reference system says about coordinates.
 
     Args:
-        definition: The system as WKT, an EPSG number, or anything else that pyproj understands.
+        definition: The system as WKT, or its number in the EPSG registry, also as "EPSG:25832".
+            Other ways to name one may name files, which are not opened.
         place: x and y of a point of the file, in its own unit.
         horizontal: That unit [m], where the file says it apart from the system.
 
     Raises:
         InputError: If coordinates in it are no lengths on the ground; or there is no pyproj.
     """
-    with library("pyproj", install="wlplan[scan]") as pyproj:
+    with library("pyproj", install="wlplan[scan]") as pyproj, _offline(pyproj):
         try:
-            system = pyproj.CRS.from_user_input(definition)
+            if code := _EPSG.fullmatch(str(definition).strip()):
+                system = pyproj.CRS.from_epsg(int(code[1]))
+            else:
+                system = pyproj.CRS.from_wkt(str(definition))
         except pyproj.exceptions.CRSError as error:
             raise InputError(
                 "has a reference system that is not understood: assign the right one, or none."
@@ -150,8 +161,27 @@ def reference_of(
     )
 
 
+@contextlib.contextmanager
+def _offline(pyproj: Any) -> Iterator[None]:
+    """Keep PROJ from fetching grids, whatever the environment of the process asks for."""
+    before = pyproj.network.is_network_enabled()
+    pyproj.network.set_network_enabled(active=False)
+    try:
+        yield
+    finally:
+        pyproj.network.set_network_enabled(active=before)
+
+
 def _check_scale(pyproj: Any, system: Any, place: tuple[float, float]) -> None:
     """Refuse maps whose metres are not those on the ground."""
+    with warnings.catch_warnings():
+        # It says that parameters are lost in this notation.
+        warnings.simplefilter("ignore")
+        parameters = system.to_proj4()
+    if _FILES.search(parameters):
+        raise InputError(
+            "has a reference system that names other files: assign the right one, or none."
+        )
     projection = pyproj.Proj(system)
     longitude, latitude = projection(*place, inverse=True)
     if not (math.isfinite(longitude) and math.isfinite(latitude)):

@@ -19,7 +19,8 @@ import numpy as np
 from flax import nnx
 
 from wlplan.errors import InputError, one_line
-from wlplan.io.files import atomic_folder
+from wlplan.io.documents import check_kinds, parse_json
+from wlplan.io.files import atomic_folder, is_ours, named
 from wlplan.io.provenance import command, versions
 from wlplan.models.ensemble import Ensemble, members_of
 from wlplan.models.grid import GRID
@@ -38,6 +39,11 @@ MODEL_FORMAT = "wlplan.model/1"
 Model = PerformanceModel | HeightChangeModel | VaePileStateModel | StallModel | Ensemble
 
 _DESCRIPTION, _WEIGHTS = "model.json", "weights"
+# What the fields of a description are that are looked at.
+_FIELDS = {
+    **dict.fromkeys(("architecture", "normaliser", "grid", "ensemble", "files"), dict),
+    **dict.fromkeys(("dataset", "training", "versions", "held_out"), dict),
+}
 
 
 class _Kind(NamedTuple):
@@ -199,6 +205,8 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
         for want, got in zip(jax.tree.leaves(expected), jax.tree.leaves(weights), strict=True):
             if want.shape != got.shape:
                 raise ValueError(f"weights of shape {got.shape}, not {want.shape}")
+            if got.dtype.kind != "f" or not np.isfinite(got).all():
+                raise ValueError("weights that are no finite numbers")
     except Exception as error:
         # A damaged description makes anything fail; to the user it means the same.
         what = one_line(error)
@@ -224,13 +232,17 @@ def read_description(
     if not os.path.lexists(directory):
         raise InputError(f"{directory}: no such model: check the name, or train it first.")
     try:
-        description: dict[str, Any] = json.loads((directory / _DESCRIPTION).read_text("utf-8"))
+        description: dict[str, Any] = parse_json((directory / _DESCRIPTION).read_bytes())
         found, got = description["format"], description["kind"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, InputError, KeyError, TypeError) as error:
         raise InputError(
             f"{directory}: is not a model of wlplan: name a directory that `wlplan train` wrote."
         ) from error
     kinds = tuple(_KINDS) if kind is None else (kind,)
+    with named(directory):
+        check_kinds(description, _FIELDS)
+        check_kinds(description.get("dataset", {}), {"fingerprints": list, "seeds": list})
+        check_kinds(description.get("training", {}), {"fractions": list, "settings": dict})
     if found != MODEL_FORMAT or got not in kinds:
         raise InputError(
             f"{directory}: is {got!r} of format {found!r}, not {' or '.join(map(repr, kinds))} of "
@@ -251,10 +263,12 @@ def check_target(directory: Path) -> None:
     if not directory.is_dir():
         raise InputError(f"{directory}: is a file: name a directory for the model.")
     with contextlib.suppress(OSError):
-        if any(directory.iterdir()) and not (directory / _DESCRIPTION).is_file():
-            raise InputError(
-                f"{directory}: holds something that is not a model: choose another place."
-            )
+        found = {entry.name for entry in directory.iterdir()}
+        others = sorted(found - {_DESCRIPTION, _WEIGHTS})
+        # It is replaced as a whole.
+        if others or (found and not is_ours(directory / _DESCRIPTION)):
+            what = one_line(others[0]) if others else "something"
+            raise InputError(f"{directory}: is not a model, it holds {what}: choose another place.")
 
 
 def _digests(directory: Path) -> dict[str, str]:

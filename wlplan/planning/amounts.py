@@ -411,9 +411,10 @@ def amount_recorded(record: object) -> Amount | None:
     Raises:
         InputError: If it makes no sense.
     """
-    if not isinstance(record, dict) or record.get("amount") not in AMOUNTS:
+    name = record.get("amount") if isinstance(record, dict) else None
+    if not isinstance(record, dict) or not isinstance(name, str) or name not in AMOUNTS:
         return None
-    kind, given = AMOUNTS[record["amount"]]
+    kind, given = AMOUNTS[name]
     numbers = {name: record[name] for name in given if name in record}
     if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in numbers.values()):
         return None

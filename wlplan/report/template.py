@@ -16,6 +16,7 @@ from typing import Any
 from jinja2 import ChainableUndefined, Environment, PackageLoader
 
 from wlplan.constants import QUANTITIES
+from wlplan.errors import shown
 from wlplan.report import said
 from wlplan.report.figures.key import KeyLine
 
@@ -90,6 +91,8 @@ def _plotly() -> str:
 def _environment() -> Environment:
     environment = Environment(
         autoescape=True,
+        # A name of a file may hold what is no character.
+        finalize=lambda value: shown(value) if type(value) is str else value,
         loader=PackageLoader("wlplan", "report"),
         undefined=ChainableUndefined,
         trim_blocks=True,

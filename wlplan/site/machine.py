@@ -50,8 +50,9 @@ class WheelLoader:
     boom_mass: float = parameter(1100.0, 10.0, 50e3, "kg")
 
     # Bucket width [m]. Brochure: 2.6 to 2.74 m over the range of buckets.
-    # Range: half a metre is five lanes; the widest fills the local map from side to side.
-    bucket_width: float = parameter(2.70, 0.5, MAP_WIDTH, "m")
+    # Range: half a metre is five lanes; the widest leaves room beside it in the local map, without
+    # which soil that it pushes aside is lost.
+    bucket_width: float = parameter(2.70, 0.5, round(MAP_WIDTH - 0.6, 1), "m")
     # Length of the bucket floor from the cutting edge to the back wall [m]. Estimate from the
     # brochure's side view.
     bucket_depth: float = parameter(1.10, 0.2, 4.0, "m")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -154,7 +155,9 @@ def add_local_change(
     The change is interpolated at the cells of the grid. Losses and gains are scaled, each by a
     factor close to one, so that both move exactly the volume that they move in the local frame;
     no cell is dug below the floor, and nothing changes behind what stands there. Where less can be
-    taken than is to be lost, less is laid down too.
+    taken than is to be lost, as on a pile that is used up or beyond the edge of the map, less is
+    laid down too, down to nothing: no soil comes from nowhere. What would be laid down beyond the
+    edge stays where it was.
 
     Args:
         height: Surface to change [m].
@@ -167,6 +170,9 @@ def add_local_change(
         The surface after [m], and what was to be lost and is not, for want of soil [m^3].
     """
     n = change.shape[0]
+    # A batch of changes at one pose: compiled for a CPU, sums over the grid are off by some percent
+    # unless the pose belongs to the batch too.
+    pose = jax.tree.map(lambda value: value + 0.0 * lax.stop_gradient(change[0, 0]), pose)
     # The map reaches half a diagonal on either side of its middle, wherever it is turned to.
     middle = to_world(pose, jnp.asarray(0.5 * (n - 1) * CELL_SIZE - displacement), jnp.asarray(0.0))
     reach = math.sqrt(2.0) * (n + 1) * CELL_SIZE / window.cell_size
@@ -188,16 +194,20 @@ def add_local_change(
     lost = area_ratio * jnp.maximum(-change, 0.0).sum()
     gained = area_ratio * jnp.maximum(change, 0.0).sum()
     loss = take(jnp.maximum(-on_grid, 0.0), available, lost)
-    short = lax.stop_gradient(lost - loss.sum())
-    if window.ground is not None:
-        # What could not be taken, in front of a wall or down to a floor, is not laid down either.
-        spared = jnp.clip(short, 0.0, lax.stop_gradient(gained))
-        gained, short = gained - spared, short - spared
+    found = loss.sum()
+    short = lax.stop_gradient(lost - found)
+    # What could not be taken is not laid down either.
+    spared = jnp.clip(short, 0.0, lax.stop_gradient(gained))
+    gained, short = gained - spared, short - spared
     gain = jnp.maximum(on_grid, 0.0)
     total = gain.sum()
-    scale = jnp.where(total > 0.0, gained / jnp.where(total > 0.0, total, 1.0), 0.0)
+    # A few cells at the edge of the map do not take what many beyond it would.
+    kept = jnp.maximum(gained - _LARGEST_GAIN * total, 0.0)
+    whole = jnp.where(kept > 0.0, jnp.maximum(found, kept), 1.0)
+    less = jnp.where(kept > 0.0, jnp.maximum(found - kept, 0.0) / whole, 1.0)
+    scale = jnp.where(total > 0.0, (gained - kept) / jnp.where(total > 0.0, total, 1.0), 0.0)
     missing = short * window.cell_size**2
-    return lax.dynamic_update_slice(height, surface - loss + scale * gain, start), missing
+    return lax.dynamic_update_slice(height, surface - less * loss + scale * gain, start), missing
 
 
 def _within_reach(
@@ -263,5 +273,7 @@ def take(
 # Ground that rises more steeply than this stands: no soil lies so [1]. 60 degrees.
 _STANDS = math.tan(math.radians(60.0))
 _MOST_STEPS = 4
+# Most that a gain is scaled by: by more, soil would pile up at the edge of a map.
+_LARGEST_GAIN = 2.0
 # Where nothing is left to take, the scale would grow without bound.
 _LARGEST_SCALE = 1e3

@@ -39,7 +39,8 @@ def largest_outline(
         Points of the line; one that does not run over the edge of the map ends where it begins.
 
     Raises:
-        InputError: If no cell is higher than `rise`, or the largest pile is not worth digging.
+        InputError: If no cell is higher than `rise`, the largest pile is not worth digging, or it
+            covers the whole map.
     """
     # Only the part of the map that holds what is higher, with a border of what is not.
     higher = above > rise
@@ -55,6 +56,11 @@ def largest_outline(
     if not _is_one_pile(lines, near, higher, cell, width):
         # Most piles are one, and to see that takes less time than to look for the largest.
         lines = _level_lines(_largest_alone(near, higher, rise, cell, width), x, y, rise)
+    if not lines:
+        raise InputError(
+            "The pile covers the whole map, so its toe is not on it: scan a wider area, down to "
+            "the floor around the pile."
+        )
     return max(lines, key=lambda line: distances_along(line)[-1])
 
 

@@ -76,10 +76,16 @@ def held_out(dataset: Dataset, description: Mapping[str, Any]) -> Dataset:
 
     Returns:
         Of a data set that the model was trained on, the test part; of another, everything.
+
+    Raises:
+        InputError: If the description does not say how that was split.
     """
     if fingerprint(dataset) not in description.get("dataset", {}).get("fingerprints", ()):
         return dataset
-    return split(dataset, fractions=tuple(description["training"]["fractions"]))[2]
+    fractions = description.get("training", {}).get("fractions", ())
+    if len(fractions) != 3 or not all(isinstance(one, float) for one in fractions):
+        raise InputError("the model does not say what it was trained on: copy or train it again.")
+    return split(dataset, fractions=tuple(fractions))[2]
 
 
 def shares_piles(dataset: Dataset, description: Mapping[str, Any]) -> bool:

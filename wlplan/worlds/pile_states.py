@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple, no_type_check
 
+import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -80,7 +81,8 @@ class LocalChange(struct.PyTreeNode, eq=False):
         change = self.phi(local, action_vector(action), volume, ground)
         height, missing = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
         if getattr(self.phi, "conserves_volume", False):
-            volume = (window.height - height).sum() * pile.cell_size**2
+            # On a pile that is used up, rounding must not be less than nothing.
+            volume = jnp.maximum((window.height - height).sum(), 0.0) * pile.cell_size**2
         return Dug(height, volume, missing)
 
 

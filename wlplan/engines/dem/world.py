@@ -160,8 +160,10 @@ class DiscreteElements(struct.PyTreeNode):
         Returns:
             The pile after, relaxed, and the performance.
         """
-        after = _leave(pile, pose, change, self.soil.repose_angle, self.schedule)
-        return after, Performance(*(numbers[k] for k in range(3)))
+        after, missing = _leave(pile, pose, change, self.soil.repose_angle, self.schedule)
+        # What left the grid is the load, as in the simulator.
+        mass = jnp.maximum(numbers[0] - missing * self.soil.density / KG_PER_TONNE, 0.0)
+        return after, Performance(mass, numbers[1], numbers[2])
 
 
 @jax.jit
@@ -173,10 +175,12 @@ def _view(pile: Pile, pose: Pose) -> Float[Array, "n n"]:
 @functools.partial(jax.jit, static_argnums=(3, 4))
 def _leave(
     pile: Pile, pose: Pose, change: Float[Array, "n n"], repose_angle: float, schedule: Schedule
-) -> Pile:
+) -> tuple[Pile, Float[Array, ""]]:
+    """The pile after, relaxed, and what of the load was not there [m^3]."""
     window, start = window_of(pile, pose)
-    dug, _ = add_local_change(window.height, window, pose, change, columns.DISPLACEMENT)
-    return settle_dug(pile, dug, start, repose_angle=repose_angle, schedule=schedule).pile
+    dug, missing = add_local_change(window.height, window, pose, change, columns.DISPLACEMENT)
+    settled = settle_dug(pile, dug, start, repose_angle=repose_angle, schedule=schedule)
+    return settled.pile, missing
 
 
 def outcome_of(cycle: CycleRecord, world: DiscreteElements) -> tuple[np.ndarray, np.ndarray]:

@@ -104,9 +104,7 @@ class Simulator(struct.PyTreeNode):
             The pile after, relaxed, the performance, and how the automaton ended.
         """
         window, start = window_of(pile, pose)
-        # What left the grid is the load: float rounding of the time stepping goes to the mass.
-        change = cycle.height - height
-        dug, missing = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+        dug, missing = _written(window, pose, height, cycle)
         settled = settle_dug(
             pile,
             dug,
@@ -114,14 +112,28 @@ class Simulator(struct.PyTreeNode):
             repose_angle=self.soil.repose_angle,
             schedule=self.schedule,
         )
-        performance = _performance(cycle)
+        performance = _performance(cycle, missing, self.soil)
         report = SolveReport(settled.rounds, settled.at_rest, settled.steepest_slope, missing)
         return settled.pile, performance, report
 
 
-def _performance(cycle: Cycle) -> Performance:
+def _written(
+    window: Pile, pose: Pose, height: Float[Array, "52 52"], cycle: Cycle
+) -> tuple[Float[Array, "n m"], Float[Array, ""]]:
+    """The part of the pile around a loading before it slides, and what is missing of it [m^3]."""
+    change = cycle.height - height
+    return add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+
+
+def _performance(cycle: Cycle, missing: Float[Array, ""], soil: Soil) -> Performance:
+    """What a cycle yields; the load is what left the grid.
+
+    The loader may have dug beyond the edge of the map, or deeper than there is soil. Rounding of
+    the time stepping goes to the mass.
+    """
     work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
-    return Performance(mass=cycle.mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ)
+    mass = jnp.maximum(cycle.mass - soil.density * missing, 0.0)
+    return Performance(mass=mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ)
 
 
 def _dig(
@@ -141,7 +153,10 @@ def _dig(
 
 @jax.jit
 def _foresee(simulator: Simulator, pile: Pile, pose: Pose, action: Action) -> Performance:
-    return _performance(_dig(simulator, pile, pose, action)[1])
+    height, cycle = _dig(simulator, pile, pose, action)
+    window, _ = window_of(pile, pose)
+    _, missing = _written(window, pose, height, cycle)
+    return _performance(cycle, missing, simulator.soil)
 
 
 @jax.jit

@@ -17,6 +17,7 @@ import numpy as np
 
 from wlplan.errors import InputError
 from wlplan.io.libraries import library, mute_stderr
+from wlplan.io.limits import check_points
 from wlplan.io.reference import reference_of
 from wlplan.io.scans import Box, PointCloud, nothing_inside, points_inside
 from wlplan.io.sensor import at_sensor
@@ -50,6 +51,9 @@ def read(path: Path, *, crop: Box | None = None) -> PointCloud:
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
         with mute_stderr(), pye57.E57(str(path)) as file:
             scans = file.scan_count
+            # Values that are all the same take no room in a file.
+            counts = [file.get_header(k).point_count for k in range(scans)]
+            check_points(sum(counts), path.stat().st_size)
             for k in range(scans):
                 header = file.get_header(k)
                 own = [np.empty((0, 3)), *_points(pye57, file, header)]

@@ -4,6 +4,9 @@ Lengths are converted to metres: x and y from the unit of the reference system, 
 the band, else of the system. Scale and offset of the band are applied. Nodata, NaN and cells that
 the alpha band or the mask leaves out are unseen. A file without georeference is refused, since
 nothing gives its cell size; so is a picture.
+
+No file is opened but the one that is named, and a world file beside it. GDAL would open whatever
+others a TIFF names for its overviews, addresses in the net too, and virtual data sets beside it.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import numpy as np
 
 from wlplan.errors import InputError
 from wlplan.io.libraries import library
+from wlplan.io.limits import MOST_UNPACKED, check_unpacked
 from wlplan.io.reference import Reference, length_unit, reference_of
 from wlplan.io.scans import Box, Heightmap, check_size, corners, nothing_inside
 
@@ -26,6 +30,16 @@ OPTIONS = ("band", "crop")
 
 # How TIFF and BigTIFF begin, in either order of bytes.
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+# How GDAL is kept to the file itself: nothing beside it counts, and no address is connected to.
+_ALONE = {
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
+    "GDAL_PAM_ENABLED": "NO",
+    "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".none",
+}
+# Where its metadata name another file: GDAL, gcore/gdaldefaultoverviews.cpp.
+_ELSEWHERE = "OVERVIEWS"
+# World files of `a.tif`: six numbers, a line each.
+_WORLD_FILES, _LONGEST_WORLD_FILE = (".tfw", ".tifw", ".wld", ".TFW"), 4096
 # What bands of heights are called.
 _HEIGHTS = re.compile(r"height|elev|altitude|\b(dsm|dtm|dem|dgm|dom|z)\b", re.IGNORECASE)
 _COLOURS = {"red", "green", "blue", "palette", "hue", "saturation", "lightness", "cyan", "magenta"}
@@ -55,9 +69,16 @@ def read(path: Path, *, band: int | None = None, crop: Box | None = None) -> Hei
     place = path.absolute()
     with (
         library("rasterio", install="wlplan[scan]") as rasterio,
+        rasterio.Env(**_ALONE),
         rasterio.open(place, driver="GTiff") as file,
     ):
-        step = file.transform
+        if file.tags(ns=_ELSEWHERE):
+            raise InputError("names other files for its overviews: export it again without them.")
+        _check_blocks(file)
+        georeference = file.transform
+        if georeference.is_identity:
+            georeference = _world_file(rasterio, path) or georeference
+        step = georeference
         if step.is_identity:
             raise InputError(
                 "has no georeference, so its cell size is unknown: add a world file beside it, or "
@@ -77,13 +98,13 @@ def read(path: Path, *, band: int | None = None, crop: Box | None = None) -> Hei
             raise InputError("has rotated or oblong cells: resample it to square cells, north up.")
         window = None
         if crop is not None:
-            window = _window(rasterio, file, crop)
-            step = file.window_transform(window)
+            window = _window(rasterio, file, crop, georeference)
+            step = rasterio.windows.transform(window, georeference)
         size = (file.width, file.height) if window is None else (window.width, window.height)
         check_size(
             size,
             cell * horizontal,
-            lambda: _overview(rasterio, file, number, window, (horizontal, vertical)),
+            lambda: _overview(rasterio, file, number, window, georeference, (horizontal, vertical)),
         )
         raw, mask = file.read(number, window=window), _seen(file, number, window)
         scale, shift = file.scales[number - 1], file.offsets[number - 1]
@@ -133,29 +154,58 @@ def _band(file: Any, wanted: int | None) -> tuple[int, tuple[str, ...]]:
     )
 
 
-def _window(rasterio: Any, file: Any, box: Box) -> Any:
+def _check_blocks(file: Any) -> None:
+    """Refuse a file whose smallest part that can be read is larger than memory warrants."""
+    together = file.count if file.interleaving.name == "pixel" else 1
+    for (rows, columns), kind in zip(file.block_shapes, file.dtypes, strict=True):
+        check_unpacked(rows * columns * np.dtype(kind).itemsize * together)
+
+
+def _world_file(rasterio: Any, path: Path) -> Any:
+    """The georeference of a world file beside a file; None if there is none that can be."""
+    for place in (path.with_suffix(ending) for ending in _WORLD_FILES):
+        try:
+            with place.open("rb") as file:
+                words = file.read(_LONGEST_WORLD_FILE).decode("ascii", "replace").split()
+            a, d, b, e, x, y = (float(word.replace(",", ".")) for word in words[:6])
+        except (OSError, ValueError):
+            continue
+        # It names the middle of the first cell, and not its corner.
+        step = rasterio.Affine(a, b, x - 0.5 * (a + b), d, e, y - 0.5 * (d + e))
+        if all(map(math.isfinite, step)):
+            return step
+    return None
+
+
+def _window(rasterio: Any, file: Any, box: Box, step: Any) -> Any:
     """The cells whose centres lie inside a rectangle."""
     low, high = corners(box)
-    ends = np.array([~file.transform * tuple(low), ~file.transform * tuple(high)]) - 0.5
+    ends = np.array([~step * tuple(low), ~step * tuple(high)]) - 0.5
     sides = (file.width, file.height)
     first = np.clip(np.ceil(ends.min(axis=0)), 0, sides).astype(int)
     stop = np.clip(np.floor(ends.max(axis=0)) + 1, 0, sides).astype(int)
     if (first >= stop).any():
-        all_of_it = np.array([file.transform * (0, 0), file.transform * sides])
+        all_of_it = np.array([step * (0, 0), step * sides])
         raise nothing_inside(all_of_it.min(axis=0), all_of_it.max(axis=0))
     return rasterio.windows.Window(*map(int, first), *map(int, stop - first))
 
 
 def _overview(
-    rasterio: Any, file: Any, number: int, window: Any, factors: tuple[float, float]
+    rasterio: Any,
+    file: Any,
+    number: int,
+    window: Any,
+    georeference: Any,
+    factors: tuple[float, float],
 ) -> str:
     """Where the piles are in a raster that is too large, read in wide cells."""
     from wlplan.io.overview import coarse_cell, where_piles_are
 
     horizontal, vertical = factors
     window = rasterio.windows.Window(0, 0, file.width, file.height) if window is None else window
-    step = file.window_transform(window)
-    if step.a < 0.0 or step.e > 0.0:
+    step = rasterio.windows.transform(window, georeference)
+    # All of it would be read, for a word of advice.
+    if step.a < 0.0 or step.e > 0.0 or window.width * window.height > MOST_UNPACKED:
         return ""
     cell = step.a * horizontal
     sides = np.array([window.width, window.height])

@@ -8,6 +8,8 @@ Messages are taken apart by the definitions of grid_map_msgs below, never by tho
 from __future__ import annotations
 
 import contextlib
+import re
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,9 @@ import numpy as np
 
 from wlplan.errors import InputError
 from wlplan.io.libraries import library
+from wlplan.io.limits import MOST_UNPACKED
 from wlplan.io.scans import Heightmap, check_size
+from wlplan.io.unpacking import Unpacker
 
 ENDINGS = (".bag", ".mcap", ".db3")
 OPTIONS = ("layer",)
@@ -32,6 +36,8 @@ _MAP = (
     "std_msgs/Float32MultiArray[] data\nuint16 outer_start_index\nuint16 inner_start_index\n"
 )
 _HEADER = "std_msgs/Header header\n"
+# Words by which a database says to compute what it does not hold.
+_COMPUTED = re.compile(r"\b(AS|VIRTUAL)\b", re.IGNORECASE)
 # Largest turn of a map against its frame that is none.
 _TURNED = 1e-3
 
@@ -108,7 +114,16 @@ def _messages(path: Path, ros1: bool) -> Iterator[tuple[str, int, bytes]]:
     if not ros1 and any(sign in str(path.absolute()) for sign in "?#%"):
         # SQLite is given its place as a URI, in which these mean something.
         raise InputError("has one of ?, # and % in its path: rename it.")
+    if path.suffix.lower() == ".db3":
+        _check_tables(path)
     reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
+    with _bounded(path.stat().st_size):
+        yield from _messages_of(reader)
+
+
+def _messages_of(reader: Any) -> Iterator[tuple[str, int, bytes]]:
+    from rosbags import rosbag1, rosbag2
+
     try:
         reader.open()
     except (rosbag1.ReaderError, rosbag2.ReaderError) as error:
@@ -123,6 +138,40 @@ def _messages(path: Path, ros1: bool) -> Iterator[tuple[str, int, bytes]]:
         if ours:
             for connection, time, content in reader.messages(connections=ours):
                 yield connection.topic, time, bytes(content)
+
+
+def _check_tables(path: Path) -> None:
+    """Refuse a database that holds more than plain tables: it may compute without end."""
+    place = f"file:{path.absolute()}?immutable=1"
+    with contextlib.closing(sqlite3.connect(place, uri=True)) as base:
+        base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(MOST_UNPACKED, path.stat().st_size + 1000))
+        found = base.execute("SELECT type, sql FROM sqlite_master").fetchall()
+    if any(kind not in ("table", "index") or _COMPUTED.search(sql or "") for kind, sql in found):
+        raise InputError("holds more than tables of messages: record it again.")
+
+
+@contextlib.contextmanager
+def _bounded(size: int) -> Iterator[None]:
+    """Have the library unpack a file of some size as far as that warrants."""
+    from rosbags.rosbag1 import reader as rosbag1
+    from rosbags.rosbag2 import storage_mcap as mcap
+
+    unpacker = Unpacker(size)
+    ours: list[tuple[dict[str, Any], dict[str, Any]]] = [
+        (rosbag1.decompressors, {"bz2": unpacker.bz2, "lz4": unpacker.lz4}),
+        (
+            mcap.DECOMPRESSORS,
+            {"lz4": lambda x, _: unpacker.lz4(x), "zstd": lambda x, _: unpacker.zstd(x)},
+        ),
+    ]
+    before = [dict(table) for table, _ in ours]
+    try:
+        for table, limited in ours:
+            table.update(limited)
+        yield
+    finally:
+        for (table, _), was in zip(ours, before, strict=True):
+            table.update(was)
 
 
 def _matrix(layer: Any) -> np.ndarray:

@@ -17,6 +17,7 @@ import numpy as np
 
 from wlplan.errors import InputError
 from wlplan.io.libraries import library, mute_stderr
+from wlplan.io.limits import check_points
 from wlplan.io.reference import Reference, length_unit_of_code, reference_of
 from wlplan.io.scans import Box, PointCloud, nothing_inside, points_inside
 
@@ -36,8 +37,8 @@ _MODEL, _GEOGRAPHIC, _PROJECTED, _PLAN_UNIT, _VERTICAL, _HEIGHT_UNIT = (
 )
 _DEGREES, _EARTH_CENTRED = 2, 3
 _LAST_CODE = 32766
-# Points that are read at once, and points that say where the middle of all is.
-_AT_ONCE, _SOME = 1 << 20, 1 << 20
+# Bytes and points that are read at once, and points that say where the middle of all is.
+_BYTES_AT_ONCE, _AT_ONCE, _SOME = 1 << 28, 1 << 20, 1 << 20
 
 
 def read(path: Path, *, crop: Box | None = None) -> PointCloud:
@@ -88,7 +89,9 @@ def _on_soil(file: Any, crop: Box | None) -> tuple[np.ndarray, tuple[str, ...]]:
     parts = [np.empty((0, 3), np.int32)]
     counts: collections.Counter[str] = collections.Counter()
     total, low, high = 0, np.full(2, np.inf), np.full(2, -np.inf)
-    for record in file.chunk_iterator(_AT_ONCE):
+    # A point may bring as much of its own as 64 KiB.
+    at_once = max(1, min(_AT_ONCE, _BYTES_AT_ONCE // file.header.point_format.size))
+    for record in file.chunk_iterator(at_once):
         points = np.stack([np.asarray(record[axis]) for axis in "XYZ"], axis=-1)
         if crop is not None:
             places = np.stack([np.asarray(record[axis], np.float64) for axis in "xy"], axis=-1)
@@ -188,16 +191,17 @@ def _check_header(path: Path) -> None:
         points = max(points, more_points)
         if whole and path.suffix.lower() == ".laz":
             # The points begin with the place of the table of chunks, which begins with a version
-            # and their number; each chunk opens with a point as it is. Compression is not known
-            # to save more than 99.9 %.
+            # and their number; each chunk opens with a point as it is.
             file.seek(start)
             (table,) = struct.unpack("<q", file.read(8))
-            whole = start < table <= size - 8 and points * record_size <= 1000 * size
+            whole = start < table <= size - 8
             if whole:
                 file.seek(table)
                 _, chunks = struct.unpack("<II", file.read(8))
                 whole = chunks * record_size <= size
         elif whole:
             whole = points * record_size <= size - start
-    if not whole:
+    if whole:
+        check_points(points, size)
+    else:
         raise InputError("is damaged or cut short, or no LAS file: copy or export it again.")

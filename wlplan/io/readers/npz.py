@@ -7,14 +7,18 @@ cells whose height is NaN are unseen.
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from wlplan.errors import InputError
+from wlplan.io.limits import check_unpacked
 from wlplan.io.scans import Heightmap, real_numbers
 
 ENDINGS = (".npz",)
+
+_MAGIC = b"\x93NUMPY"
 
 
 def read(path: Path) -> Heightmap:
@@ -25,19 +29,18 @@ def read(path: Path) -> Heightmap:
             objects.
     """
     with path.open("rb") as file:
-        if not file.read(6).startswith((b"PK", b"\x93NUMPY")):
-            raise InputError("is no .npz file: save it by np.savez with height and cell_size.")
-        file.seek(0)
-        archive = np.load(file, allow_pickle=False)
-        if isinstance(archive, np.ndarray):
+        start = file.read(6)
+        if start == _MAGIC:
             raise InputError("holds a single array: save it by np.savez with height and cell_size.")
-        # Every field is read here, so that damage shows up here.
-        try:
-            fields = {name: archive[name] for name in archive.files}
-        except ValueError as error:
-            if "Object arrays" not in str(error):
-                raise
-            raise InputError("holds Python objects: save plain arrays of numbers.") from error
+        if not start.startswith(b"PK"):
+            raise InputError("is no .npz file: save it by np.savez with height and cell_size.")
+        with zipfile.ZipFile(file) as archive:
+            # It unpacks no further than to the sizes that it says.
+            check_unpacked(sum(member.file_size for member in archive.infolist()))
+            # Every field is read here, so that damage shows up here.
+            fields = {
+                name.removesuffix(".npy"): _array(archive, name) for name in archive.namelist()
+            }
     for name in ("height", "cell_size"):
         if name not in fields:
             raise InputError(
@@ -57,3 +60,19 @@ def read(path: Path) -> Heightmap:
         valid=valid,
         ground=fields.get("ground"),
     )
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """An array of an archive; numpy itself would give out anything else as bytes."""
+    field = name.removesuffix(".npy")
+    with archive.open(name) as member:
+        if not member.read(len(_MAGIC)) == _MAGIC:
+            raise InputError(f"has a field `{field}` that is no array: save it by np.savez.")
+        member.seek(0)
+        try:
+            array: np.ndarray = np.lib.format.read_array(member, allow_pickle=False)
+        except ValueError as error:
+            if "Object arrays" not in str(error):
+                raise
+            raise InputError("holds Python objects: save plain arrays of numbers.") from error
+    return array

@@ -15,6 +15,7 @@ import numpy as np
 
 from wlplan.errors import InputError
 from wlplan.io.libraries import library
+from wlplan.io.limits import check_unpacked
 from wlplan.io.reference import Reference
 from wlplan.io.scans import PointCloud
 
@@ -93,7 +94,7 @@ def _record(head: dict[str, list[str]]) -> tuple[np.dtype, int]:
         raise InputError("has several values of x, y or z in a point: export plain points.")
     points = head.get("POINTS")
     if points is None:
-        return record, int(head["WIDTH"][0]) * int(head["HEIGHT"][0])
+        points = [str(int(head["WIDTH"][0]) * int(head["HEIGHT"][0]))]
     count = int(points[0])
     if count < 0:
         raise InputError("counts less than no points: it is damaged; copy it again.")
@@ -120,6 +121,7 @@ def _from_compressed(file: BinaryIO, record: np.dtype, count: int) -> np.ndarray
     content = file.read(packed)
     if len(content) < packed or unpacked > _MOST_SAVED * packed:
         raise InputError("is damaged or cut short: copy it again.")
+    check_unpacked(unpacked)
     if unpacked < count * record.itemsize:
         raise _cut_short(unpacked // record.itemsize, count)
     with library("lzf", install="wlplan[scan]") as lzf:

@@ -39,6 +39,11 @@ def check(kinds: Sequence[str]) -> None:
                 raise InputError(f"{kind}: {error}") from error
 
 
+def names(kinds: Sequence[str]) -> list[str]:
+    """Names of the files that kinds make."""
+    return [_module(kind).NAME for kind in kinds]
+
+
 @dataclasses.dataclass(frozen=True)
 class Played:
     """A plan that was played.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 
+from wlplan.io.files import MADE_BY
 from wlplan.report.exports import Played
 from wlplan.report.exports import _parts as parts
 
@@ -21,6 +22,7 @@ def content(played: Played) -> bytes:
     from ezdxf import filemanagement
 
     drawing = filemanagement.new("R2010", units=_METRES)
+    drawing.header.custom_vars.append("generator", MADE_BY)
     for name, colour in LAYERS.items():
         drawing.layers.add(name, color=colour)
     space = drawing.modelspace()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from wlplan.io.files import MADE_BY
 from wlplan.report.exports import Played
 from wlplan.report.exports import _parts as parts
 from wlplan.site.frame import frame_recorded
@@ -38,7 +39,8 @@ def content(played: Played) -> bytes:
     crs = frame_recorded(played.document).crs
     named = {"crs": {"type": "name", "properties": {"name": crs}}} if crs else {}
     return json.dumps(
-        {"type": "FeatureCollection", **named, "features": features}, allow_nan=False
+        {"type": "FeatureCollection", "generator": MADE_BY, **named, "features": features},
+        allow_nan=False,
     ).encode()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from wlplan.io.files import MADE_BY
 from wlplan.report.exports import Played
 from wlplan.site.frame import frame_recorded
 
@@ -36,6 +37,7 @@ def content(played: Played) -> bytes:
             nodata=_UNSEEN,
             compress="deflate",
         ) as file:
+            file.update_tags(TIFFTAG_SOFTWARE=MADE_BY)
             file.write(height.T[::-1].astype(np.float32), 1)
         content: bytes = memory.read()
     return content

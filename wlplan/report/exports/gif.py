@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.colors import Normalize
 from PIL import Image
 
+from wlplan.io.files import MADE_BY
 from wlplan.report.exports import Played
 from wlplan.report.figures.digs import order_colours
 from wlplan.report.figures.relief import (
@@ -51,7 +52,13 @@ def content(played: Played) -> bytes:
     # The last one stays a little.
     shown_for = [_SHOWN] * (len(pictures) - 1) + [4 * _SHOWN]
     pictures[0].save(
-        buffer, "GIF", save_all=True, append_images=pictures[1:], duration=shown_for, loop=0
+        buffer,
+        "GIF",
+        save_all=True,
+        append_images=pictures[1:],
+        duration=shown_for,
+        loop=0,
+        comment=MADE_BY.encode(),
     )
     return buffer.getvalue()
 

@@ -7,8 +7,10 @@ import os
 
 from matplotlib.figure import Figure
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from wlplan.io import write_bytes_atomic
+from wlplan.io.files import MADE_BY
 
 
 def png_bytes(figure: Figure, *, dpi: int = 150) -> bytes:
@@ -30,7 +32,9 @@ def png_bytes(figure: Figure, *, dpi: int = 150) -> bytes:
     # 256 colours look the same, and take a third of the room.
     few = Image.open(buffer).convert("RGB").quantize(256, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
-    few.save(buffer, format="png", optimize=True, dpi=(dpi, dpi))
+    said = PngInfo()
+    said.add_text("Software", MADE_BY)
+    few.save(buffer, format="png", optimize=True, dpi=(dpi, dpi), pnginfo=said)
     return buffer.getvalue()
 
 
