@@ -32,7 +32,7 @@ from wlplan.planning.placement import beside, receiver_at, truck_stands_on
 from wlplan.planning.plan import play
 from wlplan.planning.planners import Greedy
 from wlplan.planning.poses import distance_to_toe
-from wlplan.planning.replanning import EXTENT, Replanner
+from wlplan.planning.replanning import EXTENT, Replanner, in_map
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, GREEN, INK, ORANGE, new_figure, tidy
 from wlplan.site.machine import WA320
@@ -188,7 +188,7 @@ class _Bench:
     def __init__(self, pile: Pile, seed: int, setup: Setup):
         self._seed, self._setup = seed, setup
         self._hybrid = wlplan.load_world("hybrid")
-        self._pile = Replanner(self._hybrid, extent=SIDE).whole_map(pile)
+        self._pile = in_map(pile, wlplan.Site(), SIDE)[0]
         self._site = beside(Site(), pile)
         self._once: dict[tuple[Scanner, bool], LoadingPlan] = {}
 

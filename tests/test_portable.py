@@ -370,7 +370,7 @@ def test_a_part_that_a_world_has_not_is_refused() -> None:
             portable(name, asked_of(sliding))
     with pytest.raises(InputError, match="no learned pile state"):
         portable("pile-state", asked_of(wlplan.LearnedWorld(_psi_low())))
-    assert set(FUNCTIONS) == {"performance", "pile-state", "stall", "world"}
+    assert set(FUNCTIONS) == {"next-load", "performance", "pile-state", "stall", "world"}
 
 
 @pytest.mark.slow

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from cones import SITE, bowl_world, cone
 
+import wlplan
 from wlplan.errors import InputError
 from wlplan.planning.amounts import Tonnes, Trucks
 from wlplan.planning.load_search import LoadSearch
 from wlplan.planning.plan import plan_loads
 from wlplan.planning.planners import Greedy
-from wlplan.planning.replanning import Replanner, next_load
+from wlplan.planning.replanning import Replanner, in_map, next_load
 from wlplan.site.receiver import Receiver
 from wlplan.types import Pile
 
@@ -61,7 +62,7 @@ def test_it_is_the_greedy_plan_load_by_load() -> None:
 
 def test_what_is_beyond_the_scan_is_unseen_and_no_pile() -> None:
     pile = part_of(cone(), 17).replace(ground=jnp.full((144, 161), 0.0))
-    whole = replanner().whole_map(pile)
+    whole = in_map(pile, wlplan.Site(), 40.0)[0]
     assert whole.height.shape == (180, 180)
     np.testing.assert_array_equal(whole.height[:144, :161], pile.height)
     valid = np.asarray(whole.valid)

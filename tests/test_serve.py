@@ -33,8 +33,8 @@ from wlplan.io.readers import known_endings
 from wlplan.io.summary import info
 from wlplan.planning.amounts import Empty, Loads, Tonnes, Trucks
 from wlplan.planning.loading import Transport
+from wlplan.planning.next_loads import NextLoad
 from wlplan.planning.placement import place_of
-from wlplan.planning.replanning import NextLoad
 from wlplan.planning.watch import Watch
 from wlplan.report.headline import headline
 from wlplan.serve import guards, server

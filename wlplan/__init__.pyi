@@ -24,6 +24,7 @@ from .planning.playing import PlanResult as PlanResult
 from .planning.proposals import Proposals as Proposals
 from .planning.replanning import Replanner as Replanner
 from .planning.replanning import next_load as next_load
+from .planning.replanning import next_loads as next_loads
 from .planning.rollout import rollout as rollout
 from .report.figures import diggability_figure as diggability_figure
 from .report.figures import plan_figure as plan_figure

@@ -168,7 +168,7 @@ def materialize(values: PyTree, source: Float[Array, ""]) -> PyTree:
     return materialize_if(values, source == source, otherwise=float("nan"))
 
 
-def on_device(values: np.ndarray | np.generic) -> Array:
+def on_device(values: Array | np.ndarray | np.generic) -> Array:
     """An array of numpy's as one of JAX's; `jnp.asarray` would compile for each shape."""
     array: Array = jax.device_put(values)
     return array

@@ -194,7 +194,7 @@ class LoadSearch:
             return Ranked(starts, cusps, scores.min(axis=1)[rows])
         count = self.refine_steps * len(rows)
         watch.spend(look_gradient=count)
-        decisions, refined = _refine(
+        decisions, refined = refined_loads(
             job,
             standing,
             starts,
@@ -236,7 +236,7 @@ _At = tuple[Any, Cusps]
 """Poses [p, 2], as positions along the toe and heading offsets, and cusps of the ways."""
 
 
-def _costs_at_poses(
+def costs_at_poses(
     shared: tuple[Job, Standing, Float[Array, "a 4"]], at: _At
 ) -> tuple[Float[Array, "p a"], Float[Array, "p a"]]:
     """Cost and mass [tonne] of every action at every pose.
@@ -255,7 +255,7 @@ def _costs_at_poses(
     return jax.vmap(at_pose)(*at)
 
 
-_costs_of_portions = ParallelMap(_costs_at_poses)
+_costs_of_portions = ParallelMap(costs_at_poses)
 
 
 def _portions(count: int, size: int) -> Int[np.ndarray, "portions size"]:
@@ -346,7 +346,7 @@ def _scores_of(
 
 
 @functools.partial(jax.jit, static_argnames=("steps", "rate"))
-def _refine(
+def refined_loads(
     job: Job,
     standing: Standing,
     starts: Decisions,

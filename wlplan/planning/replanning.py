@@ -6,50 +6,39 @@ outside it counts as unseen, and is never part of the pile.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
+from wlplan.checks import is_traced
 from wlplan.errors import InputError
 from wlplan.planning.amounts import Amount, Done, Loads, Trucks, nothing_done
 from wlplan.planning.job import (
     Decisions,
-    Job,
     Standing,
     check_knows_enough,
-    decided,
     make_job,
     with_toe,
 )
 from wlplan.planning.load_search import LoadSearch, Memory
-from wlplan.planning.loading import Transport
+from wlplan.planning.next_loads import NextLoad, best_next, told
 from wlplan.planning.objective import Objective
-from wlplan.planning.search import Cusps
-from wlplan.planning.stepping import next_load as assessed_next
 from wlplan.planning.watch import Watch
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
-from wlplan.types import Action, Performance, Pile, Pose, World
+from wlplan.types import Pile, World
+from wlplan.worlds.capabilities import as_pytree
+from wlplan.xla import ParallelMap, on_device
 
 EXTENT = 40.0
 """Sides of the largest scan, unless another is given [m]."""
 
 _SEARCH = LoadSearch()
-
-
-class NextLoad(NamedTuple):
-    """The load to make next."""
-
-    pose: Pose
-    action: Action
-    performance: Performance  # as the world foresees it
-    transport: Transport
-    cost: Float[Array, ""]
 
 
 class Replanner:
@@ -114,14 +103,10 @@ class Replanner:
             raise InputError("the job is done: no load is left to plan.")
         if receiver is not None:
             self._site = self._site.replace(receiver=receiver)
-        site = self._site
-        if site.keep_out is not None:
-            count = self._count(pile.cell_size)
-            widths = [(0, count - n) for n in pile.height.shape]
-            site = site.replace(keep_out=jnp.asarray(np.pad(np.asarray(site.keep_out), widths)))
+        whole, site = in_map(pile, self._site, self._extent)
         job = make_job(
             self._world,
-            self.whole_map(pile),
+            whole,
             site=site,
             objective=self._objective,
             amount=self._amount,
@@ -141,8 +126,8 @@ class Replanner:
         decision, cusps = jax.tree.map(lambda leaf: leaf[row], (found.decisions, found.cusps))
         if not isinstance(self._amount, Trucks):
             self._memory = self._memory._replace(known=np.asarray(decision.action)[None])
-        told: NextLoad = _told(job, standing, decision, cusps)
-        return told
+        load: NextLoad = _told(job, standing, decision, cusps)
+        return load
 
     def loaded(self, mass: float, *, left: bool | None = None) -> bool:
         """Tells what the last load held.
@@ -166,37 +151,42 @@ class Replanner:
         self._done = self._amount.step(self._done, number, jnp.asarray(left)).done
         return left
 
-    def whole_map(self, pile: Pile) -> Pile:
-        """A scan in a map of the full size; what is beyond it is unseen ground.
 
-        Raises:
-            InputError: If it is too large.
-        """
-        count = self._count(pile.cell_size)
-        if max(pile.height.shape) > count:
-            sides = " by ".join(f"{n * pile.cell_size:.1f}" for n in pile.height.shape)
-            raise InputError(
-                f"the scan is {sides} m, and the largest is {self._extent:g} m: give the part "
-                f"around the pile, or a larger extent."
-            )
-        # By numpy: each extent would be compiled for.
-        widths = [(0, count - n) for n in pile.height.shape]
-        height = np.asarray(pile.height)
-        floor = np.zeros_like(height) if pile.ground is None else np.asarray(pile.ground)
-        seen = np.ones(height.shape, bool) if pile.valid is None else np.asarray(pile.valid)
-        ground = np.pad(floor, widths, mode="edge")
-        inside = np.pad(np.ones(height.shape, bool), widths)
-        return Pile(
-            height=jnp.asarray(np.where(inside, np.pad(height, widths), ground)),
-            cell_size=pile.cell_size,
-            origin=pile.origin,
-            ground=jnp.asarray(ground),
-            valid=jnp.asarray(np.pad(seen, widths)),
+def in_map(pile: Pile, site: Site, extent: float) -> tuple[Pile, Site]:
+    """A scan in a map of a fixed size, and its site; what is beyond it is unseen ground.
+
+    Args:
+        pile: The pile, of any extent up to that.
+        site: Its site.
+        extent: Sides of the map [m].
+
+    Raises:
+        InputError: If it is too large.
+    """
+    count = round(extent / pile.cell_size)
+    if max(pile.height.shape) > count:
+        sides = " by ".join(f"{n * pile.cell_size:.1f}" for n in pile.height.shape)
+        raise InputError(
+            f"the scan is {sides} m, and the largest is {extent:g} m: give the part around the "
+            f"pile, or a larger extent."
         )
-
-    def _count(self, cell: float) -> int:
-        """Cells along each side of the map."""
-        return round(self._extent / cell)
+    # By numpy: each extent would be compiled for.
+    widths = [(0, count - n) for n in pile.height.shape]
+    height = np.asarray(pile.height)
+    floor = np.zeros_like(height) if pile.ground is None else np.asarray(pile.ground)
+    seen = np.ones(height.shape, bool) if pile.valid is None else np.asarray(pile.valid)
+    ground = np.pad(floor, widths, mode="edge")
+    inside = np.pad(np.ones(height.shape, bool), widths)
+    whole = Pile(
+        height=on_device(np.where(inside, np.pad(height, widths), ground)),
+        cell_size=pile.cell_size,
+        origin=pile.origin,
+        ground=on_device(ground),
+        valid=on_device(np.pad(seen, widths)),
+    )
+    if site.keep_out is not None:
+        site = site.replace(keep_out=on_device(np.pad(np.asarray(site.keep_out), widths)))
+    return whole, site
 
 
 def next_load(
@@ -210,6 +200,10 @@ def next_load(
 ) -> NextLoad:
     """The next load from a pile; what is compiled serves every scan of up to that extent.
 
+    Under a trace it is a pure function: it passes `jit`, and `vmap` over piles and receivers. The
+    site then has to have a receiver, the extent plays no part, and where there is nothing to dig
+    the cost is infinite.
+
     Args:
         world: World to plan in.
         pile: The pile as it is.
@@ -219,14 +213,74 @@ def next_load(
         seed: Of everything random.
 
     Raises:
-        InputError: As `Replanner.next_load`.
+        InputError: As `Replanner.next_load`; under a trace also without a receiver.
     """
+    if is_traced(world, pile, site):
+        if site is None or site.receiver is None:
+            raise InputError(
+                "under a trace nobody can look for a place for the truck: give a site with a "
+                "receiver, wlplan.Site(receiver=wlplan.Receiver(x, y, heading))."
+            )
+        job = make_job(world, pile, site=site, objective=objective)
+        check_knows_enough(job)
+        return best_next(job, seed=seed)
     planner = Replanner(world, site=site, objective=objective, extent=extent, seed=seed)
     return planner.next_load(pile)
 
 
-@jax.jit
-def _told(job: Job, standing: Standing, decision: Decisions, cusps: Cusps) -> NextLoad:
-    one = decided(job, standing, decision)
-    found = assessed_next(job, standing, decision, cusps)
-    return NextLoad(one.pose, one.action, found.performance, found.transport, found.cost)
+def next_loads(
+    world: World,
+    piles: Sequence[Pile],
+    *,
+    sites: Sequence[Site | None] | None = None,
+    objective: str | Objective | Mapping[str, Any] | Callable[..., Any] = "efficiency",
+    extent: float = EXTENT,
+    seed: int = 0,
+) -> NextLoad:
+    """The next load from each of several piles, in one call; leaves [n].
+
+    Each core takes one pile at a time, and each of several devices a part of them.
+
+    Args:
+        world: World to plan in.
+        piles: Of any extents up to the largest, of one cell size.
+        sites: Of each pile; all with one machine and soil. None: the WA320 in gravel, with a
+            receiver beside each.
+        objective: As for `wlplan.plan_loads`.
+        extent: Sides of the largest scan [m].
+        seed: Of everything random.
+
+    Raises:
+        InputError: If there is no pile, or one cannot be planned for: by its number, from 0.
+    """
+    if not piles:
+        raise InputError("no pile is given: give at least one.")
+    given = [None] * len(piles) if sites is None else list(sites)
+    if len(given) != len(piles):
+        raise InputError(f"{len(piles)} piles and {len(given)} sites are given: as many of both.")
+    jobs = []
+    for number, (pile, site) in enumerate(zip(piles, given, strict=True)):
+        try:
+            whole, placed = in_map(pile, Site() if site is None else site, extent)
+            job = make_job(world, whole, site=placed, objective=objective)
+            check_knows_enough(job)
+            # Who cannot be dug at is refused before anything is computed.
+            with_toe(job)
+        except InputError as error:
+            raise InputError(f"pile {number}: {error}") from error
+        jobs.append(job.replace(world=None))
+    if len({jax.tree.structure(job) for job in jobs}) > 1:
+        raise InputError(
+            "the piles differ in cell size, machine or soil: give those that are alike."
+        )
+    rows = jax.tree.map(lambda *leaves: on_device(np.stack(leaves)), *jobs)
+    found: NextLoad = _of_each(seed)(as_pytree(world), rows)
+    return found
+
+
+@functools.cache
+def _of_each(seed: int) -> ParallelMap:
+    return ParallelMap(lambda world, job: best_next(job.replace(world=world), seed=seed))
+
+
+_told = jax.jit(told)

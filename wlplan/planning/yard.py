@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import no_type_check
+from typing import Any, no_type_check
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, UInt8
 
+from wlplan.checks import is_traced
 from wlplan.site.machine import WheelLoader
 from wlplan.terrain.standing import CLEARED, pooled, standing
 from wlplan.types import Pile
@@ -59,32 +59,33 @@ def yard_of(
     """The yard around a pile.
 
     Args:
-        pile: The pile; what its ground is of does not change. Under a trace, where its ground is
-            not known, nothing stands.
+        pile: The pile; what its ground is of does not change. Any leaf may be traced.
         machine: What drives there.
         closed: Cells of the pile's grid that nothing may drive on; None: there are none.
     """
     reach = disc_radius(machine)
     cell = pile.cell_size * _COARSE
     border = _border(reach, cell)
-    known = pile.ground is not None and not isinstance(pile.ground, jax.core.Tracer)
-    stands = np.zeros(pile.height.shape, bool)
-    if known:
-        stands = standing(np.asarray(pile.ground), pile.cell_size)
+    # By numpy where it can be: it compiles nothing.
+    traced = is_traced(pile.ground, pile.valid, closed)
+    xp: Any = jnp if traced else np
+    stands = xp.zeros(pile.height.shape, bool)
+    if pile.ground is not None:
+        stands = standing(xp.asarray(pile.ground), pile.cell_size)
     if closed is not None:
-        stands = stands | np.asarray(closed)
-    unseen = np.zeros_like(stands)
-    if pile.valid is not None and not isinstance(pile.valid, jax.core.Tracer):
-        unseen = ~np.asarray(pile.valid)
+        stands = stands | xp.asarray(closed)
+    unseen = xp.zeros_like(stands)
+    if pile.valid is not None:
+        unseen = ~xp.asarray(pile.valid)
     middle = 0.5 * (_COARSE - 1) * pile.cell_size
 
-    def flags(cells: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "n m"]:
+    def flags(cells: Any) -> Any:
         return pooled(cells.astype(np.int8), _COARSE) > 0
 
     width = [(border, border + (-n - 2 * border) % _BLOCK) for n in flags(stands).shape]
     return Yard(
-        standing=on_device(np.pad(flags(stands), width)),
-        unseen=on_device(np.pad(flags(unseen), width, constant_values=True)),
+        standing=on_device(xp.pad(flags(stands), width)),
+        unseen=on_device(xp.pad(flags(unseen), width, constant_values=True)),
         origin=jnp.asarray(pile.origin, pile.height.dtype) + (middle - border * cell),
         cell=cell,
         reach=reach,
@@ -111,7 +112,7 @@ def depths(yard: Yard, pile: Pile) -> Depths:
     soil = _most(lax.stop_gradient(pile.height - pile.floor))
     sizes = zip(yard.standing.shape, soil.shape, strict=True)
 
-    def flags(cells: Bool[np.ndarray, "nx ny"]) -> Bool[np.ndarray, "n m"]:
+    def flags(cells: Bool[np.ndarray, "nx ny"]) -> Any:
         return pooled(cells.astype(np.int8), _COARSE) > 0
 
     width = [(border, whole - part - border) for whole, part in sizes]

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jax import lax
+from jaxtyping import Float
+
+from wlplan.checks import is_traced
 
 CLEARED = 0.25
 """What stands higher over the floor than this cannot be driven over [m]. Estimate: the belly of a
@@ -22,55 +26,65 @@ _NEIGHBOURS = [
 ]
 
 
-def standing(ground: Float[np.ndarray, "nx ny"], cell_size: float) -> Bool[np.ndarray, "nx ny"]:
+def standing(ground: Float[Any, "nx ny"], cell_size: float) -> Any:
     """Cells whose ground stands higher over the floor around it than can be driven over.
 
     The floor is the highest surface below the ground that slopes no more than floors do.
 
     Args:
-        ground: What cannot be moved [m].
+        ground: What cannot be moved [m]; may be traced.
         cell_size: Grid spacing [m].
+
+    Returns:
+        Flags [nx, ny].
     """
-    ground = np.asarray(ground, np.float64)
-    if np.ptp(ground) <= CLEARED:
-        return np.zeros(ground.shape, bool)
+    if not is_traced(ground):
+        ground = np.asarray(ground, np.float64)
+        if np.ptp(ground) <= CLEARED:
+            return np.zeros(ground.shape, bool)
     times = max(1, round(_COARSE / cell_size))
     step = times * cell_size
     slope = math.tan(math.radians(_STEEPEST_FLOOR))
     low = lower_envelope(-pooled(-ground, times), slope * step, math.ceil(_SEARCHED / step))
     floor = low.repeat(times, axis=0).repeat(times, axis=1)
     floor = floor[: ground.shape[0], : ground.shape[1]]
-    stands: np.ndarray = ground - floor > CLEARED + slope * step
+    stands: Any = ground - floor > CLEARED + slope * step
     return stands
 
 
-def lower_envelope(
-    height: Float[np.ndarray, "nx ny"], rise: float, reach: int
-) -> Float[np.ndarray, "nx ny"]:
+def lower_envelope(height: Float[Any, "nx ny"], rise: float, reach: int) -> Any:
     """The highest surface below another one that nowhere rises faster, over eight neighbours.
 
     Args:
-        height: Surface [m].
+        height: Surface [m]; may be traced.
         rise: Most that it rises from a cell to the next one along an axis [m].
         reach: Cells that a low place is looked for away from a high one, at most.
     """
-    low = height
-    for _ in range(reach):
-        padded = np.pad(low, 1, mode="edge")
+
+    def lowered(low: Any) -> Any:
+        xp = low.__array_namespace__()
+        padded = xp.pad(low, 1, mode="edge")
         lowest = low
         for (i, j), apart in _NEIGHBOURS:
             shifted = padded[1 + i : 1 + i + low.shape[0], 1 + j : 1 + j + low.shape[1]]
-            lowest = np.minimum(lowest, shifted + rise * apart)
+            lowest = xp.minimum(lowest, shifted + rise * apart)
+        return lowest
+
+    if is_traced(height):
+        return lax.fori_loop(0, reach, lambda _, low: lowered(low), height)
+    low = height
+    for _ in range(reach):
+        lowest = lowered(low)
         if np.array_equal(lowest, low):
             break
         low = lowest
     return low
 
 
-def pooled(values: np.ndarray, times: int) -> np.ndarray:
-    """Largest value of so many cells a side; the last ones may be cut short."""
+def pooled(values: Any, times: int) -> Any:
+    """Largest value of so many cells a side; the last ones may be cut short; may be traced."""
+    xp = values.__array_namespace__()
     nx, ny = values.shape
-    grown = np.pad(values, ((0, -nx % times), (0, -ny % times)), mode="edge")
+    grown = xp.pad(values, ((0, -nx % times), (0, -ny % times)), mode="edge")
     nx, ny = (n // times for n in grown.shape)
-    largest: np.ndarray = grown.reshape(nx, times, ny, times).max(axis=(1, 3))
-    return largest
+    return grown.reshape(nx, times, ny, times).max(axis=(1, 3))

@@ -20,9 +20,9 @@ TOE_RISE = 0.15
 """Rise over the ground that counts as the toe [m]."""
 
 # Steps in which the way to a point of the toe is looked at [m].
-_LANE_STEP = 0.25
+LANE_STEP = 0.25
 # Spacing of the points of a toe contour [m].
-_CONTOUR_SPACING = 0.1
+CONTOUR_SPACING = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,7 @@ def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA
 
     marks = distances_along(line)
     length = float(marks[-1])
-    count = max(round(length / _CONTOUR_SPACING), 8)
+    count = max(round(length / CONTOUR_SPACING), 8)
 
     def along(distance: Float[np.ndarray, " m"]) -> Complex[np.ndarray, " m"]:
         """Points at distances along the line [m]; a closed one wraps round, an open one ends."""
@@ -103,7 +103,7 @@ def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA
     if stands.any():
         # From where the rear of the loader is when it stops behind the dig location.
         rear = machine.approach_distance + 0.5 * machine.length
-        ahead = np.arange(-rear, 0.5 * machine.bucket_depth, _LANE_STEP)
+        ahead = np.arange(-rear, 0.5 * machine.bucket_depth, LANE_STEP)
         across = machine.bucket_width * (np.arange(0.0, 1.01, 0.125) - 0.5)
         lane = points + normal * (ahead[:, None, None] + 1j * across[:, None])
         accessible &= ~_any_near(stands, lane, origin, cell).any(axis=(0, 1))
