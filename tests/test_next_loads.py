@@ -136,6 +136,7 @@ def job(pile: Pile, **options: Any) -> Any:
     return make_job(bowl_world, pile, site=SITE, **options)
 
 
+@pytest.mark.slow
 def test_it_finds_what_the_host_finds() -> None:
     pile = scenes()["cone"]
     found = _best(job(pile))
@@ -154,6 +155,7 @@ def test_it_finds_what_the_host_finds() -> None:
     assert float(found.cost) == pytest.approx(float(again.cost), rel=0.02)
 
 
+@pytest.mark.slow
 def test_nothing_to_dig_costs_infinitely_much() -> None:
     flat = scenes()["cone"].replace(height=jnp.zeros((161, 161)))
     assert math.isinf(float(_best(job(flat)).cost))

@@ -62,7 +62,7 @@ def test_it_is_the_greedy_plan_load_by_load() -> None:
 
 def test_what_is_beyond_the_scan_is_unseen_and_no_pile() -> None:
     pile = part_of(cone(), 17).replace(ground=jnp.full((144, 161), 0.0))
-    whole = in_map(pile, wlplan.Site(), 40.0)[0]
+    whole = in_map(pile, wlplan.Site(), 18.0)[0]
     assert whole.height.shape == (180, 180)
     np.testing.assert_array_equal(whole.height[:144, :161], pile.height)
     valid = np.asarray(whole.valid)

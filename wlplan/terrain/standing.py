@@ -6,10 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from jax import lax
 from jaxtyping import Float
-
-from wlplan.checks import is_traced
 
 CLEARED = 0.25
 """What stands higher over the floor than this cannot be driven over [m]. Estimate: the belly of a
@@ -32,14 +29,14 @@ def standing(ground: Float[Any, "nx ny"], cell_size: float) -> Any:
     The floor is the highest surface below the ground that slopes no more than floors do.
 
     Args:
-        ground: What cannot be moved [m]; may be traced.
+        ground: What cannot be moved [m], as an array of numpy's or, also under a trace, of JAX's.
         cell_size: Grid spacing [m].
 
     Returns:
         Flags [nx, ny].
     """
-    if not is_traced(ground):
-        ground = np.asarray(ground, np.float64)
+    if isinstance(ground, np.ndarray):
+        ground = ground.astype(np.float64)
         if np.ptp(ground) <= CLEARED:
             return np.zeros(ground.shape, bool)
     times = max(1, round(_COARSE / cell_size))
@@ -56,7 +53,7 @@ def lower_envelope(height: Float[Any, "nx ny"], rise: float, reach: int) -> Any:
     """The highest surface below another one that nowhere rises faster, over eight neighbours.
 
     Args:
-        height: Surface [m]; may be traced.
+        height: Surface [m], likewise.
         rise: Most that it rises from a cell to the next one along an axis [m].
         reach: Cells that a low place is looked for away from a high one, at most.
     """
@@ -70,7 +67,10 @@ def lower_envelope(height: Float[Any, "nx ny"], rise: float, reach: int) -> Any:
             lowest = xp.minimum(lowest, shifted + rise * apart)
         return lowest
 
-    if is_traced(height):
+    if not isinstance(height, np.ndarray):
+        # Who only looks at a scan needs no JAX.
+        from jax import lax
+
         return lax.fori_loop(0, reach, lambda _, low: lowered(low), height)
     low = height
     for _ in range(reach):
@@ -82,7 +82,7 @@ def lower_envelope(height: Float[Any, "nx ny"], rise: float, reach: int) -> Any:
 
 
 def pooled(values: Any, times: int) -> Any:
-    """Largest value of so many cells a side; the last ones may be cut short; may be traced."""
+    """Largest value of so many cells a side; the last ones may be cut short; likewise."""
     xp = values.__array_namespace__()
     nx, ny = values.shape
     grown = xp.pad(values, ((0, -nx % times), (0, -ny % times)), mode="edge")
