@@ -79,9 +79,7 @@ def diggability_map(
     return DiggabilityMap(pose, _predict(as_pytree(world), pile, pose, action))
 
 
-def located(
-    pile: Pile, locations: int, contour: ToeContour | Sequence[ToeContour] | None
-) -> Pose:
+def located(pile: Pile, locations: int, contour: ToeContour | Sequence[ToeContour] | None) -> Pose:
     """The poses of a map, leaves [n]; arguments as of `diggability_map`."""
     if contour is None:
         contour = [toe.contour for toe in toes_of(pile)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -20,25 +20,19 @@ from jaxtyping import Array, Float
 from wlplan.actions import spread_actions, squash
 from wlplan.checks import check_action, check_pile, check_world
 from wlplan.errors import InputError
-from wlplan.planning.amounts import Loads
 from wlplan.planning.descent import descend
-from wlplan.planning.driving import Room, room_of
-from wlplan.planning.good_ways import good_ways
-from wlplan.planning.job import Job, can_refine, check_knows_enough
-from wlplan.planning.lane import lane_touching
-from wlplan.planning.loading import Loading, Transport
-from wlplan.planning.objective import Objective, objective_of
+from wlplan.planning.job import Job, can_refine
+from wlplan.planning.loading import Loading
+from wlplan.planning.objective import Objective
 from wlplan.planning.objectives import OBJECTIVES
 from wlplan.planning.poses import MAX_OFFSET
 from wlplan.planning.search import Cusps
-from wlplan.planning.transport import transport
-from wlplan.planning.yard import Yard, yard_of
-from wlplan.site.frame import LOCAL
 from wlplan.site.site import Site
 from wlplan.studies.diggability import PAPER_ACTION, DiggabilityMap, located
+from wlplan.studies.map_costs import cusps_of, job_of, judged, room_around
 from wlplan.terrain.toe import ToeContour
-from wlplan.types import Action, Performance, Pile, Pose, World, action_from, action_vector
-from wlplan.worlds.capabilities import as_pytree, foresee
+from wlplan.types import Action, Pile, Pose, World, action_from, action_vector
+from wlplan.worlds.capabilities import foresee
 from wlplan.xla import ParallelMap
 
 # Load below which time / mass is held finite [tonne], as in the terms of the planners.
@@ -76,11 +70,11 @@ class LocalSearch:
     few headings are refined by Adam. In a world without a derivative nothing is refined.
     """
 
-    offsets: tuple[float, ...] = (-0.6, 0.0, 0.6)  # of the heading, before squashing
-    actions: int = 12
-    refined: int = 2  # headings whose best is refined
+    offsets: tuple[float, ...] = (0.0,)  # of the heading, before squashing
+    actions: int = 24
+    refined: int = 1  # headings whose best is refined
     steps: int = 20
-    rate: float = 0.15
+    rate: float = 0.5
 
 
 @no_type_check
@@ -181,22 +175,14 @@ def optimised_maps(
         check_pile(pile)
     search = LocalSearch() if search is None else search
     site = Site() if site is None else site
-    yards = [yard_of(pile, site.machine, site.keep_out) for pile in piles]
     # What differs in kind among maps would be compiled for.
     bare = [pile.replace(ground=pile.floor, valid=None) for pile in piles]
-    job = Job(
-        world=as_pytree(world),
-        pile=bare[0],
-        site=site.replace(frame=LOCAL, keep_out=None, truck_area=None),
-        objective=objective_of(objective),
-        yard=yards[0],
-        amount=Loads(1),
-    )
-    check_knows_enough(job)
+    jobs = [job_of(world, pile, site, objective) for pile in bare]
+    job = jobs[0]
     steps = search.steps if can_refine(job, search.steps) else 0
     toes = [None] * len(piles) if contours is None else contours
     poses = [located(pile, locations, toe) for pile, toe in zip(piles, toes, strict=True)]
-    cusps = [_cusps(job.site, *one) for one in zip(bare, yards, poses, strict=True)]
+    cusps = [cusps_of(*one) for one in zip(jobs, poses, strict=True)]
     dtype = bare[0].height.dtype
     task = _Task(
         job=job.replace(pile=None, yard=None),
@@ -208,7 +194,7 @@ def optimised_maps(
     portions = -(-locations // _PORTION)
     rows = np.minimum(np.arange(portions * _PORTION), locations - 1).reshape(portions, _PORTION)
     maps = np.repeat(np.arange(len(piles)), portions)
-    of_maps = _stacked([(pile, yard) for pile, yard in zip(bare, yards, strict=True)])
+    of_maps = _stacked([(one.pile, one.yard) for one in jobs])
     of_places = _stacked(list(zip(poses, cusps, strict=True)))
     found = _of_portions(
         task,
@@ -246,16 +232,6 @@ def _stacked(members: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *members)
 
 
-def _cusps(site: Site, pile: Pile, yard: Yard, poses: Pose) -> Cusps | None:
-    """Cusps of good ways from each location to the receiver, if there is one."""
-    if site.receiver is None:
-        return None
-    receivers = jax.tree.map(
-        lambda leaf: np.broadcast_to(np.asarray(leaf), len(poses.x)), site.receiver
-    )
-    return good_ways(pile, yard, site.machine, poses, receivers).cusps
-
-
 @no_type_check
 class _Task(struct.PyTreeNode):
     """What is asked of every location."""
@@ -264,29 +240,6 @@ class _Task(struct.PyTreeNode):
     actions: Float[Array, "a 4"]  # that are tried, before squashing
     fixed: Action
     search: LocalSearch = struct.field(pytree_node=False)
-
-
-class _Judged(NamedTuple):
-    performance: Performance
-    transport: Transport
-    cost: Array
-
-
-def _judged(
-    job: Job, room: Room | None, pose: Pose, action: Action, cusps: Cusps | None
-) -> _Judged:
-    """What one loading yields, and what it costs."""
-    performance = foresee(job.world, job.pile, pose, action)
-    if room is None:
-        nothing = jnp.zeros_like(performance.mass)
-        lane = lane_touching(pose, None, job.pile, job.yard, job.site.machine)
-        carried = Transport(nothing, nothing, lane)
-    else:
-        carried, _ = transport(
-            job.pile, pose, performance.mass, job.site, room, cusps=cusps, thorough=False
-        )
-    loading = Loading(job.pile, pose, action, performance, carried, job.site, job.world)
-    return _Judged(performance, carried, job.objective(loading))
 
 
 def _turned(anchor: Pose, offset: Float[Array, ""]) -> Pose:
@@ -299,16 +252,19 @@ def _of_portion(task: _Task, row: tuple[Any, Any]) -> OptimisedMap:
     """The map of some locations, leaves [p]."""
     (pile, yard), (anchors, cusps) = row
     job, search = task.job.replace(pile=pile, yard=yard), task.search
-    room = None if job.site.receiver is None else room_of(yard, pile)
+    room = room_around(job)
 
-    def judged(pose: Pose, action: Action, cusps: Cusps | None) -> _Judged:
-        return _judged(job, room, pose, action, cusps)
+    def at(pose: Pose, action: Action, cusps: Cusps | None) -> DiggabilityMap:
+        performance = foresee(job.world, job.pile, pose, action)
+        carried, cost = judged(job, room, (pose, action, performance), cusps)
+        return DiggabilityMap(pose, performance, action, None if room is None else carried, cost)
 
     def cost(raw: Array, anchor: Pose, cusps: Cusps | None) -> Array:
-        return judged(_turned(anchor, raw[0]), squash(raw[1:]), cusps).cost
+        found: Array = at(_turned(anchor, raw[0]), squash(raw[1:]), cusps).cost
+        return found
 
     fixed_actions = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, anchors.x.shape), task.fixed)
-    fixed = jax.vmap(judged)(anchors, fixed_actions, cusps)
+    fixed = jax.vmap(at)(anchors, fixed_actions, cusps)
     starts, at_start, where = _starts(task, cost, (anchors, cusps))
     if search.steps == 0:
         best, costs = starts, at_start
@@ -328,17 +284,7 @@ def _of_portion(task: _Task, row: tuple[Any, Any]) -> OptimisedMap:
     found = action_vector(jax.vmap(squash)(raw[:, 1:]))
     chosen = action_from(jnp.where(better[:, None], found, action_vector(fixed_actions)))
     poses = anchors.replace(heading=anchors.heading + offset)
-    final = jax.vmap(judged)(poses, chosen, cusps)
-    return OptimisedMap(
-        best=_map(job, poses, chosen, final),
-        fixed=_map(job, anchors, fixed_actions, fixed),
-        offset=offset,
-    )
-
-
-def _map(job: Job, pose: Pose, action: Action, judged: _Judged) -> DiggabilityMap:
-    carried = None if job.site.receiver is None else judged.transport
-    return DiggabilityMap(pose, judged.performance, action, carried, judged.cost)
+    return OptimisedMap(jax.vmap(at)(poses, chosen, cusps), fixed, offset)
 
 
 def _starts(
