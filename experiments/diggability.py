@@ -98,6 +98,7 @@ def _part(simulator: Any, hybrid: Any, pile: Pile, found: DiggabilityMap) -> dic
 def _with(maps: OptimisedMap, decision: str) -> tuple[Pose, Action]:
     """The fixed decisions with one of the best."""
     pose, action = maps.fixed.pose, maps.fixed.action
+    assert action is not None
     if decision == "heading":
         return maps.best.pose, action
     return pose, action.replace(**{decision: getattr(maps.best.action, decision)})
@@ -127,7 +128,8 @@ def _rounded(values: Any) -> list[float]:
 
 def _rate(performance: Mapping[str, Any]) -> np.ndarray:
     mass, spent = (np.array(performance[q], float) for q in ("mass", "time"))
-    return 3600.0 * mass / spent
+    rate: np.ndarray = 3600.0 * mass / spent
+    return rate
 
 
 def _summary(one: Mapping[str, Any]) -> dict[str, Any]:

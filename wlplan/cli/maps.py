@@ -146,7 +146,7 @@ def diggability(
     best: Optimised | None = None
     with Progress() as progress, Stopwatch() as mapping:
         progress.phase("mapping")
-        where = {"locations": locations, "action": fixed, "contour": contours}
+        where: dict[str, Any] = {"locations": locations, "action": fixed, "contour": contours}
         if optimise:
             searched = ready(
                 optimised_map(world, pile, objective=chosen, site=place, seed=seed, **where)

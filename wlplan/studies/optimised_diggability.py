@@ -29,9 +29,9 @@ from wlplan.planning.poses import MAX_OFFSET
 from wlplan.planning.search import Cusps
 from wlplan.site.site import Site
 from wlplan.studies.diggability import PAPER_ACTION, DiggabilityMap, located
-from wlplan.studies.map_costs import cusps_of, job_of, judged, room_around
+from wlplan.studies.map_costs import Judged, cusps_of, job_of, judged, room_around
 from wlplan.terrain.toe import ToeContour
-from wlplan.types import Action, Pile, Pose, World, action_from, action_vector
+from wlplan.types import Action, Performance, Pile, Pose, World, action_from, action_vector
 from wlplan.worlds.capabilities import foresee
 from wlplan.xla import ParallelMap
 
@@ -254,17 +254,20 @@ def _of_portion(task: _Task, row: tuple[Any, Any]) -> OptimisedMap:
     job, search = task.job.replace(pile=pile, yard=yard), task.search
     room = room_around(job)
 
-    def at(pose: Pose, action: Action, cusps: Cusps | None) -> DiggabilityMap:
+    def dug(pose: Pose, action: Action, cusps: Cusps | None) -> tuple[Performance, Judged]:
         performance = foresee(job.world, job.pile, pose, action)
-        carried, cost = judged(job, room, (pose, action, performance), cusps)
-        return DiggabilityMap(pose, performance, action, None if room is None else carried, cost)
+        return performance, judged(job, room, (pose, action, performance), cusps)
 
     def cost(raw: Array, anchor: Pose, cusps: Cusps | None) -> Array:
-        found: Array = at(_turned(anchor, raw[0]), squash(raw[1:]), cusps).cost
-        return found
+        return dug(_turned(anchor, raw[0]), squash(raw[1:]), cusps)[1].cost
+
+    def mapped(poses: Pose, actions: Action) -> DiggabilityMap:
+        performance, (carried, costs) = jax.vmap(dug)(poses, actions, cusps)
+        driving = None if room is None else carried
+        return DiggabilityMap(poses, performance, actions, driving, costs)
 
     fixed_actions = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, anchors.x.shape), task.fixed)
-    fixed = jax.vmap(at)(anchors, fixed_actions, cusps)
+    fixed = mapped(anchors, fixed_actions)
     starts, at_start, where = _starts(task, cost, (anchors, cusps))
     if search.steps == 0:
         best, costs = starts, at_start
@@ -279,12 +282,12 @@ def _of_portion(task: _Task, row: tuple[Any, Any]) -> OptimisedMap:
     count = len(anchors.x)
     each = _number_or_infinity(costs).reshape(count, -1)
     raw = best.reshape(count, -1, 5)[jnp.arange(count), each.argmin(axis=1)]
-    better = each.min(axis=1) < fixed.cost
+    better = each.min(axis=1) < jnp.asarray(fixed.cost)
     offset = jnp.where(better, MAX_OFFSET * jnp.tanh(raw[:, 0]), 0.0)
     found = action_vector(jax.vmap(squash)(raw[:, 1:]))
     chosen = action_from(jnp.where(better[:, None], found, action_vector(fixed_actions)))
     poses = anchors.replace(heading=anchors.heading + offset)
-    return OptimisedMap(jax.vmap(at)(poses, chosen, cusps), fixed, offset)
+    return OptimisedMap(mapped(poses, chosen), fixed, offset)
 
 
 def _starts(
