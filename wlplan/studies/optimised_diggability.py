@@ -38,7 +38,7 @@ from wlplan.xla import ParallelMap
 # Load below which time / mass is held finite [tonne], as in the terms of the planners.
 _LEAST_MASS = 0.1
 # Locations that one core searches at a time.
-_PORTION = 25
+_PORTION = 15
 
 
 @dataclasses.dataclass(frozen=True)
