@@ -44,7 +44,8 @@ def off_middle(pose: Pose) -> jax.Array:
 def missed(action: Action) -> jax.Array:
     """Squared distance to the best action, in parts of the box."""
     span = np.array(ACTION_HIGH) - np.array(ACTION_LOW)
-    return (((action_vector(action) - BEST) / span) ** 2).sum()
+    squared: jax.Array = (((action_vector(action) - BEST) / span) ** 2).sum()
+    return squared
 
 
 def bowl(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
