@@ -67,9 +67,9 @@ def spike(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
     return pile, Performance(MASS + 0.0 * pose.x, time, 300.0 + 0.0 * pose.x)
 
 
-def ring(radius: float = 5.0, count: int = 400) -> ToeContour:
-    """A circular toe around zero, whose inward normals lead to it."""
-    angle = np.linspace(0.0, 2.0 * math.pi, count, endpoint=False)
+def ring(radius: float = 5.0, count: int = 400, first: float = 0.0) -> ToeContour:
+    """A circular toe around zero, whose inward normals lead to it; it begins at an angle [rad]."""
+    angle = np.linspace(0.0, 2.0 * math.pi, count, endpoint=False) + first
     return ToeContour(
         points=radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1),
         heading=np.arctan2(-np.sin(angle), -np.cos(angle)),
@@ -121,6 +121,18 @@ def test_a_heading_stays_within_its_limit() -> None:
     offset = np.asarray(mapped(eager).offset)
     assert (offset <= MAX_OFFSET).all()
     assert (offset > 0.8 * MAX_OFFSET).all()
+
+
+def test_headings_are_within_half_a_turn() -> None:
+    # The inward normal of the first place is 3 degrees short of half a turn.
+    contour = ring(first=math.radians(-33.0))
+    found: Any = optimised_map(
+        bowl, cone(), locations=LOCATIONS, contour=contour, search=LocalSearch(steps=60)
+    )
+    assert np.asarray(found.fixed.pose.heading + found.offset).max() > math.pi
+    assert np.abs(found.best.pose.heading).max() <= math.pi
+    turn = np.asarray(found.best.pose.heading) - np.asarray(found.fixed.pose.heading)
+    np.testing.assert_allclose(np.cos(turn), np.cos(found.offset), atol=1e-5)
 
 
 def test_the_best_is_never_worse_than_the_fixed_action() -> None:

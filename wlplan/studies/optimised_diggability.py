@@ -286,7 +286,9 @@ def _of_portion(task: _Task, row: tuple[Any, Any]) -> OptimisedMap:
     offset = jnp.where(better, MAX_OFFSET * jnp.tanh(raw[:, 0]), 0.0)
     found = action_vector(jax.vmap(squash)(raw[:, 1:]))
     chosen = action_from(jnp.where(better[:, None], found, action_vector(fixed_actions)))
-    poses = anchors.replace(heading=anchors.heading + offset)
+    heading = anchors.heading + offset
+    over = jnp.where(jnp.abs(heading) > np.pi, jnp.sign(heading), 0.0)
+    poses = anchors.replace(heading=heading - 2.0 * np.pi * over)
     return OptimisedMap(mapped(poses, chosen), fixed, offset)
 
 
