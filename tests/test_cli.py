@@ -685,6 +685,28 @@ def test_a_map_is_written(
     assert strict_json(run(*words, "--json")[1]) == document
 
 
+def test_an_optimised_map_is_written(
+    run: Run, scan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_figures: None
+) -> None:
+    monkeypatch.setattr(worlds, "load_world", lambda name, **_: FakeWorld(1.0).__call__)
+    out = tmp_path / "out"
+    words = ("diggability", scan, "--locations", 4, "--optimise")
+    code, said, _ = run(*words, "--out", out)
+    assert code == 0
+    assert "t/h instead of" in said
+    document = strict_json((out / "diggability.json").read_text())
+    assert document["objective"] == "rate"
+    assert [pile["locations"] for pile in document["piles"]] == [4]
+    for place in document["locations"]:
+        # The less the boom's gain, the less time.
+        assert place["action"]["k_bm"] < 0.3
+        assert place["time"] < place["fixed"]["time"] == pytest.approx(14.51)
+        assert place["gain"] > 40.0
+    assert "best of each place" in Page((out / "report.html").read_text()).text
+    refused(run("diggability", scan, "--objective", "rate"), "--optimise or --truck")
+    refused(run(*words, "--objective", "none"), "'none' is no objective")
+
+
 # --- models
 
 

@@ -37,6 +37,10 @@ from .site.receiver import Receiver as Receiver
 from .site.site import Site as Site
 from .studies.diggability import DiggabilityMap as DiggabilityMap
 from .studies.diggability import diggability_map as diggability_map
+from .studies.optimised_diggability import LocalSearch as LocalSearch
+from .studies.optimised_diggability import OptimisedMap as OptimisedMap
+from .studies.optimised_diggability import optimised_map as optimised_map
+from .studies.optimised_diggability import optimised_maps as optimised_maps
 from .terrain.automaton import relax as relax
 from .terrain.seed_piles import seed_pile as seed_pile
 from .terrain.toe import toe_contour as toe_contour

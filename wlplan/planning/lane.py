@@ -24,7 +24,7 @@ LANE_END = 0.3
 
 
 def lane_touching(
-    pose: Pose, receiver: Receiver, pile: Pile, yard: Yard, machine: WheelLoader
+    pose: Pose, receiver: Receiver | None, pile: Pile, yard: Yard, machine: WheelLoader
 ) -> Float[Array, ""]:
     """Length of the approach lane in which something stands that cannot be driven over [m].
 
@@ -33,7 +33,7 @@ def lane_touching(
 
     Args:
         pose: Dig location and heading.
-        receiver: Whose truck must not stand there either.
+        receiver: Whose truck must not stand there either; None: there is no truck.
         pile: The pile as it is.
         yard: What stands still there.
         machine: What drives.
@@ -48,7 +48,10 @@ def lane_touching(
     x, y = to_world(pose, *jnp.meshgrid(along, jnp.asarray(left, dtype), indexing="ij"))
     over = sample(pile.height - pile.floor, pile, x, y) - (CLEARED - _SOIL_RAMP)
     soil = jnp.clip(over / _SOIL_RAMP, 0.0, 1.0)
-    goal = receiver.x, receiver.y, receiver.heading
-    truck = jnp.clip(1.0 - truck_distance(x, y, goal, machine) / _TRUCK_RAMP, 0.0, 1.0)
-    most = jnp.maximum(jnp.maximum(soil, truck), is_standing(yard, x, y)).max(axis=1)
+    blocked = jnp.maximum(soil, is_standing(yard, x, y))
+    if receiver is not None:
+        goal = receiver.x, receiver.y, receiver.heading
+        truck = jnp.clip(1.0 - truck_distance(x, y, goal, machine) / _TRUCK_RAMP, 0.0, 1.0)
+        blocked = jnp.maximum(blocked, truck)
+    most = blocked.max(axis=1)
     return most.sum() * (last - first) / rows

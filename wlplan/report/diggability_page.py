@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from wlplan.constants import QUANTITIES
 from wlplan.report import figures
@@ -48,7 +49,27 @@ def render_map(
         worst=order[len(order) - few :][::-1].tolist(),
         galleries=[_gallery(document, pile, shades)],
         settings=settings or {},
+        optimised=_optimised(document),
     )
+
+
+def _optimised(document: Mapping[str, Any]) -> dict[str, float] | None:
+    """What the best heading and action of each place are worth; None: they were not searched."""
+    places = document["locations"]
+    if not places or not all("fixed" in place and "gain" in place for place in places):
+        return None
+    best, fixed = (
+        np.array([one[q] for one in rows for q in ("mass", "time", "rate")], float).reshape(-1, 3)
+        for rows in (places, [place["fixed"] for place in places])
+    )
+    found = {
+        f"{name}_{q}": float(values[:, k].mean())
+        for name, values in (("best", best), ("fixed", fixed))
+        for k, q in enumerate(("mass", "time", "rate"))
+    }
+    gain = np.array([place["gain"] for place in places], float)
+    turned = np.abs([place["offset"] for place in places])
+    return {**found, "gain": float(np.median(gain)), "turned": float(np.median(turned))}
 
 
 def shades_of(document: Mapping[str, Any]) -> dict[str, Shade]:
@@ -62,23 +83,63 @@ def shades_of(document: Mapping[str, Any]) -> dict[str, Shade]:
         name: Shade(title, unit, digits, values(name), name == "mass")
         for name, (title, unit, digits) in QUANTITIES.items()
     }
+
+    def known(name: str) -> bool:
+        return bool(places) and all(name in place for place in places)
+
     rate = 3600.0 * shades["mass"].values / np.maximum(shades["time"].values, 1e-9)
-    shades["rate"] = Shade("rate of digging", "t/h", 0, rate, True)
-    if places and all("cost" in place for place in places):
+    title = "rate of the cycle" if known("transport") else "rate of digging"
+    rate = values("rate") if known("rate") else rate
+    shades["rate"] = Shade(title, "t/h", 0, rate, True)
+    if known("fixed"):
+        fixed = np.array([place["fixed"]["rate"] for place in places], float)
+        shades["fixed"] = Shade("rate with one action everywhere", "t/h", 0, fixed, True)
+    if known("gain"):
+        shades["gain"] = Shade("gain", "%", 0, values("gain"), True)
+    if known("cost"):
         shades["cost"] = Shade("cost", "1", 2, values("cost"), False)
+    if known("deviation"):
+        # Of what is divided: the errors of mass and time count as independent.
+        parts = [
+            np.array([place["deviation"][q] for place in places], float)
+            / np.maximum(np.abs(shades[q].values), 1e-9)
+            for q in ("mass", "time")
+        ]
+        shades["deviation"] = Shade(
+            "deviation of mass and time", "%", 1, 100.0 * np.hypot(*parts), False
+        )
     return shades
 
 
-def _gallery(document: Mapping[str, Any], pile: Pile, shades: Mapping[str, Shade]) -> Gallery:
+def map_figure(document: Mapping[str, Any], pile: Pile) -> Figure:
+    """Maps of what a diggability.json holds: mass, time and work; if optimised, rate and gain too.
+
+    Args:
+        document: Its content.
+        pile: The pile that it is of, in the frame of the document.
+    """
+    shades = shades_of(document)
+    names = [*QUANTITIES, *(("rate", "gain") if "gain" in shades else ())]
+    return figures.shades_figure(
+        pile, _poses(document), [shades[name] for name in names], frame=frame_recorded(document)
+    )
+
+
+def _poses(document: Mapping[str, Any]) -> Pose:
     columns = ([place[name] for place in document["locations"]] for name in ("x", "y", "heading"))
-    pose = Pose(*(np.array(column, float) for column in columns))
-    frame = frame_recorded(document)
+    return Pose(*(np.array(column, float) for column in columns))
+
+
+def _gallery(document: Mapping[str, Any], pile: Pile, shades: Mapping[str, Shade]) -> Gallery:
+    pose, frame = _poses(document), frame_recorded(document)
     pictures = []
     for shade in shades.values():
         place = document["locations"][shade.best]
         pictures.append(
             Picture(
-                figures.png_bytes(figures.shade_figure(pile, pose, shade, frame=frame), dpi=_DPI),
+                figures.png_bytes(
+                    figures.shades_figure(pile, pose, [shade], frame=frame), dpi=_DPI
+                ),
                 f"Map of the pile with {len(shade.values)} places around it, coloured by "
                 f"{shade.title}: {shade.values.min():.{shade.digits}f} to "
                 f"{shade.values.max():.{shade.digits}f} {shade.unit}, the best at "
@@ -89,7 +150,7 @@ def _gallery(document: Mapping[str, Any], pile: Pile, shades: Mapping[str, Shade
         "Each quantity around the pile",
         pictures,
         columns=2,
-        caption="Lines stand at the places, along the headings. Yellow is good in every map.",
+        caption="Arrows end at the places, along the headings. Yellow is good in every map.",
     )
 
 

@@ -6,7 +6,7 @@ the north-west. What figures share: `style` for colours and axes, `relief` for t
 `digs` and `truck` for what lies on it, `png` for files.
 """
 
-from wlplan.report.figures.diggability import Shade, diggability_figure, shade_figure
+from wlplan.report.figures.diggability import Shade, diggability_figure, shades_figure
 from wlplan.report.figures.plan import (
     PlanOnPile,
     left_figure,
@@ -25,7 +25,7 @@ __all__ = [
     "plan_figure",
     "png_bytes",
     "save_figure",
-    "shade_figure",
+    "shades_figure",
     "step_figure",
     "total_figure",
     "totals_figure",

@@ -1,4 +1,4 @@
-"""What one action would yield all around a pile. Paper, the figure of section 7.4."""
+"""What loads would yield all around a pile. Paper, the figure of section 7.4."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
@@ -24,14 +23,13 @@ from wlplan.report.figures.relief import (
     view_of,
 )
 from wlplan.report.figures.style import FAINT, INK, frame_map, new_figure, tidy
-from wlplan.report.legs import approaches
 from wlplan.site.frame import LOCAL, Frame
 from wlplan.studies.diggability import DiggabilityMap
 from wlplan.types import Pile, Pose
 
 # Yellow is good in every map: much mass, little time and work.
 _MUCH_IS_GOOD, _LITTLE_IS_GOOD = colormaps["viridis"], colormaps["viridis_r"]
-# Length of the line that marks a location [m]; at most this part of the view.
+# Length of the arrow that marks a location [m]; at most this part of the view.
 _TICK = 1.5
 _TICK_PART = 0.09
 # Width of one map, and height of the histogram below it [inch].
@@ -73,10 +71,10 @@ class Shade:
 
 
 def diggability_figure(pile: Pile, diggability: DiggabilityMap, *, frame: Frame = LOCAL) -> Figure:
-    """Mass, time and work of one action at locations around the pile.
+    """Mass, time and work of loads at locations around the pile.
 
-    The colours of the lines, which stand on the toe along the inward normals, are those of the
-    histograms below. Yellow is good: much mass, little time and work.
+    The colours of the arrows, which end on the toe along the headings, are those of the histograms
+    below. Yellow is good: much mass, little time and work.
 
     Args:
         pile: The pile the map was made for.
@@ -93,28 +91,25 @@ def diggability_figure(pile: Pile, diggability: DiggabilityMap, *, frame: Frame 
         )
         for name, (title, unit, digits) in QUANTITIES.items()
     ]
-    return _maps(pile, diggability.pose, shades, frame)
+    return shades_figure(pile, diggability.pose, shades, frame=frame)
 
 
-def shade_figure(pile: Pile, pose: Pose, shade: Shade, *, frame: Frame = LOCAL) -> Figure:
-    """One map with its histogram, as in `diggability_figure`.
+def shades_figure(
+    pile: Pile, pose: Pose, shades: Sequence[Shade], *, frame: Frame = LOCAL
+) -> Figure:
+    """Maps side by side with their histograms, as in `diggability_figure`.
 
     Args:
         pile: The pile the map was made for.
         pose: The locations, leaves [n].
-        shade: What their colours say.
+        shades: What the colours of each map say.
         frame: What the coordinates on the axes are in.
     """
-    return _maps(pile, pose, [shade], frame)
-
-
-def _maps(pile: Pile, pose: Pose, shades: Sequence[Shade], frame: Frame) -> Figure:
     digs = np.stack([np.asarray(pose.x), np.asarray(pose.y)], axis=-1).astype(float)
     heading = np.asarray(pose.heading, float)
     inward = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     view = grow_to_ratio(view_of(pile, digs - _TICK * inward))
     tick = min(_TICK, _TICK_PART * float(np.ptp(view, axis=0).max()))
-    ticks = approaches(digs, heading, tick)
 
     tall = _MAP * float(np.divide(*np.ptp(view, axis=0)[::-1]))
     figure = new_figure(1.1 + _MAP * len(shades), tall + _HISTOGRAM + 1.1)
@@ -128,7 +123,7 @@ def _maps(pile: Pile, pose: Pose, shades: Sequence[Shade], frame: Frame) -> Figu
         draw_pile(panel, pile, STONE, norm, contour_alpha=0.35)
         title = f"{shade.title[:1].upper()}{shade.title[1:]} [{shade.unit}]"
         frame_map(panel, view, title, frame)
-        _draw_ticks(panel, ticks, shade.colours(scale(values)))
+        _draw_arrows(panel, digs, tick * inward, shade.colours(scale(values)))
         _draw_histogram(histogram, values, edges, scale, shade.colours)
         middle, low, high = (
             f"{value:,.{shade.digits}f}" for value in (shade.median, values.min(), values.max())
@@ -144,15 +139,29 @@ def _maps(pile: Pile, pose: Pose, shades: Sequence[Shade], frame: Frame) -> Figu
     return figure
 
 
-def _draw_ticks(
-    panel: Axes, ticks: Float[np.ndarray, "n 2 2"], colours: Float[np.ndarray, "n 4"]
+def _draw_arrows(
+    panel: Axes,
+    digs: Float[np.ndarray, "n 2"],
+    along: Float[np.ndarray, "n 2"],
+    colours: Float[np.ndarray, "n 4"],
 ) -> None:
-    """Lines from point to point [m] on a map, each in its colour, on white ones."""
-    for colour, width, zorder in (("white", 4.2, 4), (list(colours), 2.8, 5)):
-        panel.add_collection(
-            LineCollection(
-                list(ticks), colors=colour, linewidths=width, capstyle="round", zorder=zorder
-            )
+    """Arrows that end at points [m] on a map, each in its colour, on white ones."""
+    length = float(np.hypot(*along[0]))
+    for colour, width, zorder in (("white", 0.11, 4), (list(colours), 0.07, 5)):
+        panel.quiver(
+            *digs.T,
+            *along.T,
+            color=colour,
+            pivot="tip",
+            angles="xy",
+            scale_units="xy",
+            scale=1.0,
+            units="xy",
+            width=width * length,
+            headwidth=3.4 if zorder == 4 else 4.2,
+            headlength=4.0,
+            headaxislength=3.4,
+            zorder=zorder,
         )
 
 
