@@ -1,13 +1,12 @@
 """Whatever is written is whole or not there, whichever operation on files fails, and when."""
 
 import contextlib
-import errno
+import dataclasses
 import itertools
 import os
-import resource
 import shutil
-import subprocess
 import sys
+import types
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import FrameType
@@ -26,14 +25,39 @@ from faults import (
     Tree,
     check_all_or_nothing,
     for_every_fault,
-    struck,
     tree,
 )
+from flax import nnx
+from test_cli import FakeWorld, fake_play
 
+from experiments._common.results import write_result
+from wlplan import cli
+from wlplan.cli.progress import Stopwatch
+from wlplan.dataset import collecting, store
+from wlplan.dataset.layout import Layout
+from wlplan.dataset.variables import VARIABLES
 from wlplan.errors import InputError
-from wlplan.io import files, write_pile, write_plan, write_text_atomic
-from wlplan.io.files import atomic_folder
+from wlplan.io import files, read_pile, read_plan, write_pile, write_plan, write_text_atomic
+from wlplan.io.files import MADE_BY, atomic_folder
+from wlplan.models.normaliser import Normaliser
+from wlplan.models.psi_low import LowPerformanceModel, PsiLow
+from wlplan.models.storage import load_model, save_model
+from wlplan.planning import piles
+from wlplan.planning import plan as planner
+from wlplan.portable import export
+from wlplan.portable.function import Port, PortableFunction
+from wlplan.report import diggability_page, making, pictures
+from wlplan.report import figures as plots
+from wlplan.report.document import plan_document
+from wlplan.site.site import Site
+from wlplan.studies import diggability as studies
+from wlplan.studies.diggability import DiggabilityMap
+from wlplan.studies.gradcheck import Component, GradientCheck
 from wlplan.terrain.seed_piles import seed_pile
+from wlplan.terrain.toe import edge_poses, toe_contour
+from wlplan.training.fitting import SavedState
+from wlplan.types import Performance
+from wlplan.worlds import shipped as worlds
 
 
 def ended(call: Callable[[], object]) -> Callable[[], Ended]:
@@ -220,3 +244,251 @@ def test_piles_and_plans_are_whole(folder: Path, kind: Kind) -> None:
         check_all_or_nothing(folder, kind, ended(write))
         (folder / name).write_text("old")
         check_all_or_nothing(folder, kind, ended(write))
+
+
+# --- commands
+
+Command = Callable[..., Callable[[], Ended]]
+
+
+@pytest.fixture
+def scan(tmp_path: Path) -> Path:
+    """A pile file, beside the folder whose files fail."""
+    path = tmp_path / "scan.npz"
+    write_pile(path, seed_pile("conical", slope=0.5, height=1.0, seed=1))
+    return path
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """The command line with these words; what takes long is a stand-in, what writes is real."""
+    # Wall clocks would differ from run to run.
+    monkeypatch.setattr(Stopwatch, "text", lambda _: "1.0 s")
+    monkeypatch.setattr(worlds, "load_world", lambda *_, **__: FakeWorld(1.0))
+    monkeypatch.setattr(planner, "play", fake_play)
+    monkeypatch.setattr(piles, "heights_after", lambda *_: None)
+    monkeypatch.setattr(plots, "png_bytes", lambda *_, **__: f"PNG {MADE_BY}".encode())
+    monkeypatch.setattr(pictures, "galleries_of", lambda *_, **__: [])
+    for name in (one for one in plots.__all__ if one.endswith("_figure")):
+        monkeypatch.setattr(plots, name, lambda *_, **__: None)
+
+    def words_of(*words: object) -> Callable[[], Ended]:
+        def run() -> Ended:
+            capsys.readouterr()
+            code = cli.main([*map(str, words), "--quiet"])
+            return code, capsys.readouterr().err
+
+        return run
+
+    return words_of
+
+
+@pytest.fixture
+def plan_file(tmp_path: Path, scan: Path) -> Path:
+    """A plan for the pile."""
+    poses = edge_poses(toe_contour(read_pile(scan)), 2)
+    loads = [
+        {
+            **{name: float(getattr(poses, name)[n]) for name in ("x", "y", "heading")},
+            "action": dict.fromkeys(("delta_bm", "k_bm", "delta_bk", "k_bk"), 0.5),
+        }
+        for n in range(2)
+    ]
+    path = tmp_path / "given.json"
+    write_plan(path, {"format": "wlplan.plan/1", "loads": loads})
+    return path
+
+
+def old_files(folder: Path, *names: str) -> Path:
+    """A folder with older files of ours, and one of somebody else."""
+    folder.mkdir()
+    for name in names:
+        (folder / name).write_text('{"format": "wlplan.old/1"}')
+    (folder / "notes.txt").write_text("theirs")
+    return folder
+
+
+# Commands take a second each: the other kinds are tested above.
+each_kind = pytest.mark.parametrize("kind", (ERROR, INTERRUPT_AFTER), ids=lambda kind: kind.name)
+
+
+@pytest.mark.slow
+@each_kind
+def test_simulate_writes_all_or_nothing(
+    folder: Path, command: Command, scan: Path, plan_file: Path, kind: Kind
+) -> None:
+    out = old_files(folder / "out", "plan.json", "totals.png", "report.html")
+    run = command("simulate", scan, plan_file, "--out", out, "--also", "geojson")
+    check_all_or_nothing(folder, kind, run)
+
+
+@pytest.mark.slow
+@each_kind
+def test_plan_writes_all_or_nothing(
+    folder: Path,
+    command: Command,
+    scan: Path,
+    plan_file: Path,
+    kind: Kind,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given, pile, site = read_plan(plan_file)[0], read_pile(scan), Site()
+    played = fake_play(FakeWorld(1.0), pile, given, site)
+    document = plan_document(pile, played, site=site, predicted=played.rollout.performance)
+    document |= {"pile": {"file": "scan.npz"}, "notes": []}
+    made = making.MadePlan(document, pile, played, played, site, FakeWorld(1.0), {})
+    monkeypatch.setattr(making, "make_plan", lambda *_, **__: made)
+    monkeypatch.setattr(making.MadePlan, "heights", None)
+    check_all_or_nothing(folder, kind, command("plan", scan, "--out", folder / "new", "--json"))
+
+
+@each_kind
+def test_bench_writes_all_or_nothing(
+    folder: Path, command: Command, kind: Kind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "wlplan.studies.bench.run_bench", lambda *_, **__: {"format": "wlplan.bench/1"}
+    )
+    out = old_files(folder / "out", "bench.json")
+    check_all_or_nothing(folder, kind, command("bench", "--out", out, "--json"))
+
+
+@pytest.mark.slow
+@each_kind
+def test_gradcheck_writes_all_or_nothing(
+    folder: Path, command: Command, scan: Path, kind: Kind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    component = Component(1, "x", 1.0, 1.0, 0.0, 1e-6, "ok")
+    check = GradientCheck(1.0, 1e-6, 1e-4, (component,))
+    monkeypatch.setattr("wlplan.studies.gradcheck.check_gradient", lambda *_, **__: check)
+    out = old_files(folder / "out", "gradcheck.json")
+    run = command("gradcheck", scan, "--loads", 1, "--out", out, "--json")
+    check_all_or_nothing(folder, kind, run)
+
+
+@pytest.mark.slow
+@each_kind
+def test_diggability_writes_all_or_nothing(
+    folder: Path, command: Command, scan: Path, kind: Kind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses = edge_poses(toe_contour(read_pile(scan)), 3)
+    values = np.arange(1.0, 4.0)
+    found = DiggabilityMap(poses, Performance(values, values, values))
+    monkeypatch.setattr(studies, "diggability_map", lambda *_, **__: found)
+    monkeypatch.setattr(studies, "stalls_on_map", lambda *_: None)
+    monkeypatch.setattr(diggability_page, "render_map", lambda *_, **__: f"<p>{MADE_BY}</p>")
+    out = old_files(folder / "out", "report.html", "diggability.json")
+    run = command("diggability", scan, "--locations", 3, "--out", out, "--json")
+    check_all_or_nothing(folder, kind, run)
+
+
+@pytest.mark.slow
+@each_kind
+def test_an_export_is_whole(folder: Path, kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
+    numbers = np.ones((2, 3), np.float32)
+    port = Port("x", "any", "1", shape=(3,), dtype="float32")
+    function = PortableFunction("f", "a test", lambda x: x, (port,), (port,), (numbers,), {})
+    portable = types.SimpleNamespace(
+        ENDING="bin",
+        LIBRARIES=(),
+        content=lambda _: b"content" * 1000,
+        outputs=lambda *_: (numbers,),
+        facts=lambda *_: {},
+    )
+    monkeypatch.setattr(export, "_format", lambda _: portable)
+    monkeypatch.setattr(export, "_outputs", lambda _: (numbers,))
+    run = ended(lambda: export.export(function, folder / "out"))
+    check_all_or_nothing(folder, kind, run)
+    with contextlib.suppress(InputError):
+        run()
+    function = dataclasses.replace(function, meaning="another")
+    check_all_or_nothing(folder, kind, ended(lambda: export.export(function, folder / "out")))
+
+
+@pytest.fixture(scope="module")
+def model() -> LowPerformanceModel:
+    """A model that knows nothing."""
+    network = PsiLow((4,), rngs=nnx.Rngs(0))
+    graph, params = nnx.split(network)
+    inputs, outputs = (Normaliser.of(np.eye(n, dtype=np.float32)) for n in (8, 3))
+    return LowPerformanceModel(params, inputs, outputs, graph)
+
+
+@pytest.mark.slow
+@each_kind
+@pytest.mark.parametrize("is_there", [False, True])
+def test_a_model_is_whole(
+    folder: Path, model: LowPerformanceModel, kind: Kind, is_there: bool
+) -> None:
+    """Its files carry random names, so new ones are told by what they load as."""
+    if is_there:
+        save_model(folder / "m", model, {"held_out": {"old": 1}})
+    state = SavedState(folder / ".m.training.npz", {})
+
+    def save() -> None:
+        save_model(folder / "m", model, {})
+        state.remove()
+
+    found: list[tuple[Fault, Ended, Tree]] = []
+
+    def keep(fault: Fault, end: Ended, left: Tree) -> None:
+        found.append((fault, end, left))
+        if left != before:
+            # Loading checks every byte.
+            load_model(folder / "m")
+            assert sorted(path.name for path in folder.iterdir()) == ["m"]
+            assert "old" not in (folder / "m" / "model.json").read_text()
+
+    before = tree(folder)
+    count, *_ = for_every_fault(folder, kind, ended(save), keep, same=loads)
+    assert count > 0
+    assert {end[0] for _, end, _ in found} <= {0, 2, 130}
+
+
+def loads(left: Tree) -> list[str]:
+    """What is comparable of a folder with a model: the names that are not random."""
+    return [name for name in left if name.count("/") < 2]
+
+
+@pytest.mark.slow
+@each_kind
+def test_a_collection_goes_on_after_any_fault(
+    folder: Path, command: Command, kind: Kind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it leaves can be continued by the same command, and ends with the same bytes."""
+    few = {name: VARIABLES[name] for name in ("mass", "rollout")}
+    monkeypatch.setattr(store, "VARIABLES", few)
+    monkeypatch.setattr(store, "command", lambda: "wlplan collect")
+
+    def batches(layout: Layout, start: int, *_: object) -> Iterator[dict[str, np.ndarray]]:
+        for first in range(start, layout.size, layout.batch_cycles):
+            count = min(layout.batch_cycles, layout.size - first)
+            numbers = np.arange(first, first + count)
+            yield {name: numbers.astype(v.dtype) for name, v in few.items()}
+
+    monkeypatch.setattr(collecting, "collect_batches", batches)
+    monkeypatch.setattr("wlplan.dataset.layout._BATCH", 1)
+    run = command("collect", "--cycles", 60, "--out", folder / "data.zarr")
+    wanted = 130 if kind is INTERRUPT_AFTER else 2
+    rows: list[tuple[Fault, Ended, Tree]] = []
+
+    def go_on(fault: Fault, end: Ended, left: Tree) -> None:
+        assert end[0] in (wanted, 0), (fault.struck, end)
+        assert end[0] == 0 or end[1].count("\n") == 1, end
+        assert not [name for name in left if name.endswith(".lock")], fault.struck
+        assert run() == (0, "")
+        rows.append((fault, end, tree(folder)))
+
+    count, _, after = for_every_fault(folder, kind, run, go_on)
+    assert count > 0
+    for fault, _, left in rows:
+        assert left == after, (fault.struck, sorted(set(left) ^ set(after)))
+
+
+@each_kind
+def test_results_of_experiments_are_whole(folder: Path, kind: Kind) -> None:
+    def write() -> None:
+        write_result("automaton", "smoke", {"rows": [1, 2]}, folder)
+
+    (folder / "automaton.json").write_text("old")
+    check_all_or_nothing(folder, kind, ended(write))

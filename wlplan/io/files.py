@@ -110,7 +110,7 @@ def atomic_folder(
     temporary = _temporary(place / place.name if adds else place)
     with contextlib.ExitStack() as at_end:
         for folder in reversed(missing):
-            at_end.callback(_remove_empty, folder)
+            at_end.callback(remove_empty, folder)
         # Twice: an interrupt may cut the first short.
         at_end.callback(_remove_folder, temporary)
         at_end.callback(_remove_folder, temporary)
@@ -126,8 +126,8 @@ def atomic_folder(
             os.replace(temporary, place)
 
 
-def _remove_empty(folder: Path) -> None:
-    """Remove a folder if nothing is in it."""
+def remove_empty(folder: Path) -> None:
+    """Remove a folder if it is there and nothing is in it."""
     with contextlib.suppress(OSError):
         folder.rmdir()
 
