@@ -310,7 +310,7 @@ def move(
     inside = jnp.clip((x - along) / CELL_SIZE + 0.5, 0.0, 1.0) * jnp.clip(
         (along - x + machine.bucket_depth) / CELL_SIZE + 0.5, 0.0, 1.0
     )
-    # A machine that brakes badly comes to the end of the map: what it pushes stays on its last rows.
+    # A machine that brakes badly comes to the end of the map: what it pushes stays on its last row.
     ahead = jnp.minimum(x + _PUSH_LENGTH / 2, float(_ALONG[-1]))
     laid = _hat(along[1:-1] - ahead, _PUSH_LENGTH / 2)
     laid = jnp.pad(laid, ((1, 1), (0, 0)), mode="edge")
