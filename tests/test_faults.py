@@ -59,6 +59,9 @@ from wlplan.training.fitting import SavedState
 from wlplan.types import Performance
 from wlplan.worlds import shipped as worlds
 
+# A file that was just opened as Ctrl-C came is closed when Python forgets it.
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
 
 def ended(call: Callable[[], object]) -> Callable[[], Ended]:
     """How a call of Python ends, as the command line would say it."""
@@ -164,8 +167,6 @@ def shown(found: Tree) -> dict[str, bytes | None]:
 
 
 @each_writer
-# A file that was just opened.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_ctrl_c_at_any_line_leaves_all_old_or_all_new(folder: Path, name: str) -> None:
     """At most a hidden folder stays, where it comes between two statements of the tidying up."""
     filled, write = WRITERS[name]

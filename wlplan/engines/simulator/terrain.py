@@ -319,7 +319,7 @@ def move(
     share = step / _SLIDE_TIME
     over = share * _over_the_sides(fill, lanes.width, machine)
     on_map = total(inside[1:-1])
-    over = over * (on_map > 1e-6)
+    over = over * (on_map > 1e-6)[None]
     along_sides = inside / jnp.maximum(on_map, 1e-6)[None]
     bucket, open_part, passed, inside, laid, along_sides, over = materialize_if(
         (bucket, open_part, passed, inside, laid, along_sides, over), wanted
