@@ -5,6 +5,7 @@ import dataclasses
 import itertools
 import os
 import shutil
+import subprocess
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping
@@ -12,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from cones import SITE
@@ -502,3 +504,101 @@ def test_results_of_experiments_are_whole(folder: Path, kind: Kind) -> None:
 
     (folder / "automaton.json").write_text("old")
     check_all_or_nothing(folder, kind, ended(write))
+
+
+# --- disks, and several writers
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 300 kB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(place)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("only root may mount a small disk")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(
+    small_disk: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Also where the bytes are written by libraries that are no Python: the weights of a model."""
+    (small_disk / "theirs").write_bytes(b"x" * 200_000)
+    write_text_atomic(small_disk / "a", "old")
+    before = tree(small_disk)
+    graph, params = nnx.split(PsiLow((200, 200), rngs=nnx.Rngs(0)))
+    inputs, outputs = (Normaliser.of(np.eye(n, dtype=np.float32)) for n in (8, 3))
+    large = LowPerformanceModel(params, inputs, outputs, graph)
+    random = np.random.default_rng(0).normal(size=(300, 300)).astype(np.float32)
+    pile = seed_pile("conical", slope=0.5, height=1.0)
+    pile = pile.replace(height=jnp.asarray(random), ground=None)
+    for write in (
+        lambda: write_text_atomic(small_disk / "a", "new" * 100_000),
+        lambda: write_pile(small_disk / "pile.npz", pile),
+        lambda: save_model(small_disk / "above" / "m", large, {}),
+    ):
+        with pytest.raises(InputError, match="No space left on device") as refused:
+            write()
+        assert "\n" not in str(refused.value)
+        assert tree(small_disk) == before
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_disk_that_is_read_only_is_one_line(
+    small_disk: Path, command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "wlplan.studies.bench.run_bench", lambda *_, **__: {"format": "wlplan.bench/1"}
+    )
+    out = old_files(small_disk / "out", "bench.json")
+    before = tree(small_disk)
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    code, said = command("bench", "--out", out, "--json")()
+    assert code == 2
+    assert said == f"error: {out}: cannot be written (Read-only file system): choose another " + (
+        "folder.\n"
+    )
+    assert tree(small_disk) == before
+
+
+# Writes its own letter into a file and into two folders, over and over.
+_TWO = """
+import sys
+from pathlib import Path
+from wlplan.io.files import atomic_folder, write_text_atomic
+here, letter = Path(sys.argv[1]), sys.argv[2]
+for n in range(int(sys.argv[3])):
+    write_text_atomic(here / "file", letter * 100_000)
+    for existing in ("replace", "add"):
+        with atomic_folder(here / existing, existing=existing) as new:
+            for name in "abc":
+                write_text_atomic(new / name, letter * 10_000)
+"""
+
+
+def test_of_two_writers_at_once_neither_breaks_the_other(tmp_path: Path) -> None:
+    """Each file is one writer's at every moment; a folder that is replaced is so at the end."""
+    for existing in ("replace", "add"):
+        with atomic_folder(tmp_path / existing) as new:
+            for name in "abc":
+                write_text_atomic(new / name, "A" * 10_000)
+    write_text_atomic(tmp_path / "file", "A" * 100_000)
+    writers = [
+        subprocess.Popen([sys.executable, "-c", _TWO, str(tmp_path), letter, "100"])
+        for letter in "AB"
+    ]
+    looks = 0
+    while any(writer.poll() is None for writer in writers):
+        for path in (tmp_path / "file", tmp_path / "add" / "b", tmp_path / "replace" / "c"):
+            text = path.read_text()
+            assert len(text) in (10_000, 100_000)
+            assert text in ("A" * len(text), "B" * len(text))
+            looks += 1
+    assert looks > 100
+    assert [writer.returncode for writer in writers] == [0, 0]
+    assert sorted(tree(tmp_path)) == sorted(
+        ["file", *(["add", "replace"]), *(f"{f}/{n}" for f in ("add", "replace") for n in "abc")]
+    )
+    assert len({(tmp_path / "replace" / name).read_text() for name in "abc"}) == 1

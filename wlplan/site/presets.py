@@ -283,10 +283,11 @@ def _check_machine(machine: WheelLoader, label: Callable[[str], str]) -> None:
     reaching = machine.mass * speed**3 / (3.0 * distance)
     least = max(holding, reaching)
     if machine.wheel_power < least:
-        what = "hold" if holding >= reaching else f"reach within {distance:g} m"
+        what = "hold" if holding >= reaching else "reach"
+        within = "" if holding >= reaching else f" within {distance:g} m"
         raise InputError(
             f"wheel_power is {machine.wheel_power:g} W, too little for {machine.mass:g} kg to "
-            f"{what} a travel_speed of {speed:.3g} m/s: give at least {least:.3g} W."
+            f"{what} a travel_speed of {speed:.3g} m/s{within}: give at least {least:.3g} W."
         )
     # The time stepping of the speed diverges beyond.
     stiffest = machine.mass / _LONGEST_STEP
