@@ -258,6 +258,8 @@ def for_every_fault(
         check(fault, ended, tree(folder))
     restore()
     shutil.rmtree(kept)
+    # For docs/reliability.md, see there.
+    print(f"faults: {number - 1}")
     return number - 1, before, after
 
 

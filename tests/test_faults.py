@@ -534,11 +534,12 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(
     random = np.random.default_rng(0).normal(size=(300, 300)).astype(np.float32)
     pile = seed_pile("conical", slope=0.5, height=1.0)
     pile = pile.replace(height=jnp.asarray(random), ground=None)
-    for write in (
+    writers: tuple[Callable[[], None], ...] = (
         lambda: write_text_atomic(small_disk / "a", "new" * 100_000),
         lambda: write_pile(small_disk / "pile.npz", pile),
         lambda: save_model(small_disk / "above" / "m", large, {}),
-    ):
+    )
+    for write in writers:
         with pytest.raises(InputError, match="No space left on device") as refused:
             write()
         assert "\n" not in str(refused.value)

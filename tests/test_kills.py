@@ -16,7 +16,7 @@ from faults import Tree, tree
 pytestmark = pytest.mark.slow
 
 # How often each process is killed.
-KILLS_OF_WRITERS, KILLS_OF_COLLECT, KILLS_OF_TRAIN = 60, 8, 8
+KILLS_OF_WRITERS, KILLS_OF_COLLECT, KILLS_OF_TRAIN = 60, 5, 5
 
 # Replaces a file and a folder, and adds to another, over and over.
 WRITER = """
