@@ -186,6 +186,7 @@ def test_ctrl_c_at_any_line_leaves_all_old_or_all_new(folder: Path, name: str) -
             after = left
             break
         states.append(left)
+    print(f"lines: {len(states)}")
     assert len(states) > 10
     assert all(shown(left) in (shown(before), shown(after)) for left in states)
     assert sum(left not in (before, after) for left in states) <= 1
