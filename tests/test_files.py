@@ -2,6 +2,7 @@
 
 import errno
 import os
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -182,6 +183,15 @@ def test_a_folder_is_replaced_with_all_it_holds(target: Path) -> None:
     assert contents(target.parent) == below("out", filled("new"))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere it takes two steps")
+def test_on_linux_a_folder_is_replaced_in_one_step(
+    target: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing(monkeypatch, 1)
+    make(target, existing="replace")
+    assert contents(target.parent) == below("out", filled("new"))
+
+
 @pytest.mark.parametrize("which", [1, 2])
 @pytest.mark.parametrize("after", [False, True])
 @pytest.mark.parametrize("failure", FAILURES)
@@ -192,6 +202,8 @@ def test_a_replacement_that_fails_restores_the_old(
     after: bool,
     failure: type[BaseException],
 ) -> None:
+    """Where it takes two steps."""
+    monkeypatch.setattr(files, "_exchange", lambda *_: False)
     failing(monkeypatch, which, failure, after)
     with pytest.raises(failure):
         make(target, existing="replace")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -29,7 +30,7 @@ def checked_folder(name: str, files: Iterable[str] = ()) -> Path:
         InputError: If it is a file, below one, or cannot be written; or one of the files is there
             and not from us.
     """
-    from wlplan.io.files import is_ours
+    from wlplan.io.files import is_ours, remove_empty
 
     if not name.strip():
         raise InputError("the name of the folder to write to is empty: give one.")
@@ -47,12 +48,17 @@ def checked_folder(name: str, files: Iterable[str] = ()) -> Path:
     if not place.is_dir():
         raise InputError(f"{name}: {place} is a file: name a folder to write to.")
     probe = place / f".wlplan-{secrets.token_hex(6)}.tmp"
-    try:
-        probe.mkdir()
-        probe.rmdir()
-    except OSError as error:
-        reason = one_line(error.strerror or error)
-        raise InputError(f"{name}: cannot be written ({reason}): choose another folder.") from error
+    with contextlib.ExitStack() as at_end:
+        # Twice: the first may be interrupted, or fail.
+        at_end.callback(remove_empty, probe)
+        at_end.callback(remove_empty, probe)
+        try:
+            probe.mkdir()
+        except OSError as error:
+            reason = one_line(error.strerror or error)
+            raise InputError(
+                f"{name}: cannot be written ({reason}): choose another folder."
+            ) from error
     return folder
 
 

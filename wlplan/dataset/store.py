@@ -86,8 +86,13 @@ def make_arrays(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> No
     """Makes a group with these attributes and the empty arrays of a part."""
     import zarr
     from zarr.codecs import BloscCodec
+    from zarr.core.buffer import Buffer
 
-    group = zarr.create_group(store=str(path), zarr_format=3, attributes=dict(attributes))
+    # Made in memory: on a disk that is full, zarr's threads go on writing after we have heard of it
+    # and removed what was there.
+    files: dict[str, Buffer] = {}
+    memory = zarr.storage.MemoryStore(files)
+    group = zarr.create_group(store=memory, zarr_format=3, attributes=dict(attributes))
     for name, variable in VARIABLES.items():
         group.create_array(
             name,
@@ -107,7 +112,10 @@ def make_arrays(path: Path, layout: Layout, attributes: Mapping[str, Any]) -> No
     # a convention, not yet part of the format, says the warning.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        zarr.consolidate_metadata(str(path), zarr_format=3)
+        zarr.consolidate_metadata(memory, zarr_format=3)
+    for name, content in files.items():
+        (path / name).parent.mkdir(exist_ok=True)
+        replace_file(path / name, content.to_bytes())
 
 
 def resume(path: Path, wanted: Mapping[str, Any]) -> int:
@@ -250,7 +258,12 @@ def lock(path: Path) -> Iterator[None]:
             file.write(mine)
         yield
     finally:
-        lock.unlink(missing_ok=True)
+        # What fails, or is interrupted, may succeed the second time.
+        try:
+            lock.unlink(missing_ok=True)
+        finally:
+            with contextlib.suppress(OSError):
+                lock.unlink(missing_ok=True)
 
 
 def _is_young(lock: Path) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import os
 import re
@@ -17,6 +18,8 @@ from wlplan.errors import InputError, one_line
 
 # Windows would else change the ends of lines.
 _BINARY = getattr(os, "O_BINARY", 0)
+# Of Linux: relative to the working directory, and names that change places.
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
@@ -78,7 +81,9 @@ def atomic_folder(
             that folder is meant.
         existing: What is done if there is a folder already:
             "refuse": nothing, an error is raised, unless it is empty;
-            "replace": the new folder takes its place in one step, and the old one is removed;
+            "replace": the new folder takes its place, and the old one is removed. On Linux that
+            is one step; elsewhere a process that is killed between the two leaves none there, and
+            the old one beside it, hidden;
             "add": the new files are moved into it one by one, over files of the same name; all
             other files stay, and if a move fails the earlier ones are undone.
         locked: The caller keeps other processes from writing to `path`. Temporary folders that
@@ -100,37 +105,31 @@ def atomic_folder(
         raise FileExistsError(errno.EEXIST, "the folder is there and not empty", str(path))
     if locked:
         _remove_leftovers(place)
-    made: list[Path] = []
-    try:
-        _make_parents(place, made)
-        # Files are added from inside the folder: it may be all that can be written to.
-        temporary = _temporary(place / place.name if adds else place)
-        try:
-            temporary.mkdir(0o700)
-            yield temporary
-            temporary.chmod(0o777 & ~_mask())
-            if adds:
-                _move_files(temporary, place)
-            elif existing == "replace" and place.is_dir():
-                _replace_folder(place, temporary)
-            else:
-                os.replace(temporary, place)
-        finally:
-            _remove_folder(temporary)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            for folder in reversed(made):
-                folder.rmdir()
-        raise
-
-
-def _make_parents(place: Path, made: list[Path]) -> None:
-    """Make the missing folders above a place, listed in `made` from the outermost on."""
     missing = [folder for folder in place.parents if not folder.exists()]
-    for folder in reversed(missing):
-        with contextlib.suppress(FileExistsError):
-            folder.mkdir()
-            made.append(folder)
+    # Files are added from inside the folder: it may be all that can be written to.
+    temporary = _temporary(place / place.name if adds else place)
+    with contextlib.ExitStack() as at_end:
+        for folder in reversed(missing):
+            at_end.callback(remove_empty, folder)
+        # Twice: an interrupt may cut the first short.
+        at_end.callback(_remove_folder, temporary)
+        at_end.callback(_remove_folder, temporary)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        temporary.mkdir(0o700)
+        yield temporary
+        temporary.chmod(0o777 & ~_mask())
+        if adds:
+            _move_files(temporary, place)
+        elif existing == "replace" and place.is_dir():
+            _replace_folder(place, temporary)
+        else:
+            os.replace(temporary, place)
+
+
+def remove_empty(folder: Path) -> None:
+    """Remove a folder if it is there and nothing is in it."""
+    with contextlib.suppress(OSError):
+        folder.rmdir()
 
 
 def _move_files(source: Path, target: Path) -> None:
@@ -170,7 +169,11 @@ def _set_aside(path: Path, aside: Path) -> None:
 
 
 def _replace_folder(place: Path, new: Path) -> None:
-    """Put a new folder in the place of an old one, which is restored if that fails."""
+    """Put a new folder in the place of an old one, which is removed; restored if that fails."""
+    # In one step, so that no process that is killed leaves the place empty. The old one is then
+    # where the new one was, and goes with it.
+    if _exchange(new, place):
+        return
     old = new.with_suffix(".old")
     try:
         os.replace(place, old)
@@ -181,16 +184,33 @@ def _replace_folder(place: Path, new: Path) -> None:
                 os.replace(place, new)
             os.replace(old, place)
         raise
-    _remove_folder(old)
+    try:
+        _remove_folder(old)
+    finally:
+        _remove_folder(old)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Have two folders change places in one step; False where that cannot be: only Linux can."""
+    try:
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
+    except (AttributeError, OSError, TypeError):
+        return False
+    places = (os.fsencode(path) for path in (one, other))
+    if rename(_AT_FDCWD, next(places), _AT_FDCWD, next(places), _RENAME_EXCHANGE) == 0:
+        return True
+    code = ctypes.get_errno()
+    # Kernels and file systems that do not know it.
+    if code in (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP):
+        return False
+    raise OSError(code, os.strerror(code), str(other))
 
 
 def _remove_folder(folder: Path) -> None:
-    """Remove a folder with all it holds, as far as possible; an interrupt does not stop that."""
-    try:
+    """Remove a folder with all it holds, as far as possible."""
+    # What fails once may succeed.
+    for _ in range(2):
         shutil.rmtree(folder, ignore_errors=True)
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
 
 
 def _mask() -> int:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -118,8 +120,6 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
     Raises:
         InputError: If something that is not a model is there, or it cannot be written.
     """
-    import orbax.checkpoint as ocp
-
     directory = Path(directory)
     check_target(directory)
     kind = kind_of(model)
@@ -129,8 +129,7 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
     weights = jax.tree.map(np.asarray, nnx.to_pure_dict(member.params))
     try:
         with atomic_folder(directory, existing="replace") as new:
-            with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
-                checkpointer.save(new / _WEIGHTS, args=ocp.args.PyTreeSave(weights))
+            _write_weights(new / _WEIGHTS, weights)
             # Names the directory it was made in, and nothing reads it on a file system that
             # renames in one step.
             (new / _WEIGHTS / "commit_success.txt").unlink(missing_ok=True)
@@ -156,6 +155,31 @@ def save_model(directory: str | os.PathLike[str], model: Model, meta: Mapping[st
         raise InputError(
             f"{directory}: cannot be written ({reason}): choose another place."
         ) from error
+
+
+def _write_weights(path: Path, weights: Any) -> None:
+    """Writes a checkpoint.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    import orbax.checkpoint as ocp
+
+    # It logs pages on stderr of what it also raises.
+    log = logging.getLogger("absl")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
+            checkpointer.save(path, args=ocp.args.PyTreeSave(weights))
+    except ValueError as error:
+        # What writes the arrays is no Python and knows no `OSError`.
+        if (told := re.search(r"os_error_code='(\d+)'", str(error))) is None:
+            raise
+        code = int(told[1])
+        raise OSError(code, os.strerror(code)) from error
+    finally:
+        log.setLevel(level)
 
 
 def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Model:

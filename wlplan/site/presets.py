@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from wlplan.constants import GRAVITY
 from wlplan.errors import InputError
 from wlplan.site.machine import MACHINES, WA320, WheelLoader
 from wlplan.site.parameters import Range, ranges_of
@@ -274,6 +275,19 @@ def _check_machine(machine: WheelLoader, label: Callable[[str], str]) -> None:
             f"tip_radius is {machine.tip_radius:g} m, and {label('boom_low')}, boom_length and "
             f"pivot_height put the bucket pin {pin:.3g} m over the ground: the lowered bucket "
             f"needs 0 m or more, and less than tip_radius."
+        )
+    # A machine that does not hold its travel speed, or does not reach it on the way back, is one
+    # for which the closed forms of approach and retreat are not meant (seen: cycles of 440 s).
+    speed, distance = machine.travel_speed, machine.approach_distance
+    holding = machine.rolling_resistance * machine.mass * GRAVITY * speed
+    reaching = machine.mass * speed**3 / (3.0 * distance)
+    least = max(holding, reaching)
+    if machine.wheel_power < least:
+        what = "hold" if holding >= reaching else "reach"
+        within = "" if holding >= reaching else f" within {distance:g} m"
+        raise InputError(
+            f"wheel_power is {machine.wheel_power:g} W, too little for {machine.mass:g} kg to "
+            f"{what} a travel_speed of {speed:.3g} m/s{within}: give at least {least:.3g} W."
         )
     # The time stepping of the speed diverges beyond.
     stiffest = machine.mass / _LONGEST_STEP

@@ -310,13 +310,17 @@ def move(
     inside = jnp.clip((x - along) / CELL_SIZE + 0.5, 0.0, 1.0) * jnp.clip(
         (along - x + machine.bucket_depth) / CELL_SIZE + 0.5, 0.0, 1.0
     )
-    laid = _hat(along[1:-1] - (x + _PUSH_LENGTH / 2), _PUSH_LENGTH / 2)
+    # A machine that brakes badly comes to the end of the map: what it pushes stays on its last row.
+    ahead = jnp.minimum(x + _PUSH_LENGTH / 2, float(_ALONG[-1]))
+    laid = _hat(along[1:-1] - ahead, _PUSH_LENGTH / 2)
     laid = jnp.pad(laid, ((1, 1), (0, 0)), mode="edge")
     # What stands higher than the side plates falls off to the ground beside them. A whole sweep
     # of the automaton stands for _SLIDE_TIME, a shorter step for its share of one.
     share = step / _SLIDE_TIME
     over = share * _over_the_sides(fill, lanes.width, machine)
-    along_sides = inside / jnp.maximum(total(inside[1:-1]), 1e-6)[None]
+    on_map = total(inside[1:-1])
+    over = over * (on_map > 1e-6)[None]
+    along_sides = inside / jnp.maximum(on_map, 1e-6)[None]
     bucket, open_part, passed, inside, laid, along_sides, over = materialize_if(
         (bucket, open_part, passed, inside, laid, along_sides, over), wanted
     )
