@@ -800,7 +800,7 @@ def test_a_whole_data_set_does_not_go_on_as_a_shard(copy: Path) -> None:
         ({"settings": {}}, ("settings (step) None",)),
         ({"cycles_done": 0}, ("0 of the 6 cycles", "shard 2/3")),
         ({"first_cycle": 3}, ("cut in another way",)),
-        ({"shards": "three"}, ("cut in another way",)),
+        ({"shards": "three"}, ("is not a data set of wlplan",)),
         ({"shards": 4}, ("cut in another way",)),
         ({"format": "wlplan.dataset/9"}, ("wlplan.dataset/9",)),
     ],
