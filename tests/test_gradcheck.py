@@ -343,7 +343,7 @@ def test_the_command_and_the_module_agree() -> None:
         (["--world", "moon"], "simulator"),
         (["--objective", "fun"], "efficiency"),
         (["--step", "0"], "--step"),
-        (["--step", "nan"], "step is nan"),
+        (["--step", "nan"], "'nan' is not a finite number"),
         (["--tolerance", "-1"], "--tolerance"),
         (["--model", "missing"], "no such model"),
         (["--out", ""], "empty"),
