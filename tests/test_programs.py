@@ -156,3 +156,24 @@ def test_the_command_shows_and_clears(place: Path) -> None:
     assert cleared["cleared"] >= 2
     assert cleared["programs"] == 0
     assert not kept.exists()
+
+
+@pytest.mark.parametrize(
+    ("version", "given", "expected"),
+    [
+        ("0.10.2", None, "--xla_cpu_use_fusion_emitters=false"),
+        ("0.8.0", "", "--xla_cpu_use_fusion_emitters=false"),
+        ("0.11.0", None, None),
+        ("0.7.2", None, None),
+        ("0.10.2", "--xla_dump_to=here", "--xla_dump_to=here"),
+    ],
+)
+def test_only_versions_that_know_the_flag_are_told(
+    version: str, given: str | None, expected: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(programs, "_version", lambda name: version)
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    if given is not None:
+        monkeypatch.setenv("XLA_FLAGS", given)
+    programs.compile_fast()
+    assert os.environ.get("XLA_FLAGS") == expected

@@ -32,6 +32,9 @@ from wlplan.cli import (
 from wlplan.cli.said import mend_streams, tell
 from wlplan.errors import InputError
 
+# Commands in which a person waits for what is compiled. What `collect` and `train` make is to be
+# the same to the bit as from Python, so XLA is there as it is by default.
+_IN_A_HURRY = ("plan", "simulate", "serve", "diggability")
 # Commands in which nothing is compiled.
 _WITHOUT_PROGRAMS = ("info", "cache")
 
@@ -63,6 +66,8 @@ def wlplan(context: click.Context) -> None:
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
     elif context.invoked_subcommand not in _WITHOUT_PROGRAMS:
+        if context.invoked_subcommand in _IN_A_HURRY:
+            programs.compile_fast()
         context.obj = programs.use_cache()
 
 
