@@ -14,7 +14,13 @@ sys.path[:0] = [str(ROOT / "docs/_site"), str(ROOT)]
 project = "wlplan"
 author = "the authors of wlplan"
 root_doc = "docs/index"
-include_patterns = ["docs/**.md", "experiments/README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md"]
+include_patterns = [
+    "docs/**.md",
+    "experiments/README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "SECURITY.md",
+]
 exclude_patterns = [".*", "**/.*", "out", "demo", "build", "dist", "wlplan", "tests"]
 
 extensions = [

@@ -11,7 +11,7 @@ os.environ.setdefault(
 os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(2**30))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 # Two workers share two cores; and programs that run for moments are not worth XLA's last effort.
-# `make demo` has XLA as it is by default.
+# `wlplan plan` leaves the fusion emitters out too, see `wlplan.cli.programs`.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=1 "
@@ -20,6 +20,7 @@ os.environ.setdefault(
 
 import jax
 import jaxtyping
+from browsers import browser as browser
 
 jaxtyping.install_import_hook("wlplan", "beartype.beartype")
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -1,9 +1,6 @@
 """The pages in a real browser: Debian's Chromium, or one that CHROMIUM names."""
 
 import math
-import os
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from browsers import CHROMIUM
 from cones import wide_cone
 from test_diggability_page import document
 
@@ -26,7 +24,6 @@ from wlplan.site.frame import frame_recorded
 from wlplan.site.receiver import Receiver
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium")
 # What was seen stays there, to be looked at.
 SHOTS = Path(__file__).parents[1] / "out" / "pages"
 
@@ -131,18 +128,6 @@ def page_of(pile: Pile, count: int, name: str = "scan.laz") -> str:
         ),
         scene=scene_of(pile, heights, document),
     )
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Chromium that draws in three dimensions by its processor."""
-    from playwright.sync_api import sync_playwright
-
-    drawing = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *drawing])
-        yield browser
-        browser.close()
 
 
 class Seen:

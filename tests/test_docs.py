@@ -2,9 +2,7 @@
 
 import ast
 import importlib.util
-import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,10 +10,10 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from browsers import CHROMIUM
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium")
 
 
 def site_module(name: str) -> ModuleType:

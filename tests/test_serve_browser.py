@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from browsers import CHROMIUM
 from serving import Served, serving
-from test_browser import CHROMIUM, SHOTS
+from test_browser import SHOTS
 
 import wlplan
 from wlplan.io import write_pile
@@ -40,18 +41,6 @@ def served() -> Iterator[Served]:
     quick = Greedy(actions=8, refine_steps=10, refined=2, poses_per_metre=0.5)
     with serving(planner=quick) as one:
         yield one
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Chromium that draws in three dimensions by its processor."""
-    from playwright.sync_api import sync_playwright
-
-    drawing = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *drawing])
-        yield browser
-        browser.close()
 
 
 class Opened:

@@ -42,6 +42,8 @@ QUANTITIES = {
 
 # Most that may be asked for in one plan: more is a slip of the keyboard.
 MOST_LOADS, MOST_TONNES, MOST_TRUCKS = 500, 2_000.0, 50
+# What is asked for if nobody says how much.
+DEFAULT_LOADS = 15
 # Payloads of trucks [tonne] and waits for the next one [s] that there are.
 PAYLOADS, EXCHANGES = (1.0, 500.0), (0.0, 3600.0)
 # Most of a pile that may be asked to remain of it [%].

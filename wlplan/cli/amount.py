@@ -9,6 +9,7 @@ import click
 
 from wlplan.cli.values import FiniteRange
 from wlplan.constants import (
+    DEFAULT_LOADS,
     EXCHANGES,
     MOST_LOADS,
     MOST_REMAINING,
@@ -19,8 +20,6 @@ from wlplan.constants import (
 
 if TYPE_CHECKING:
     from wlplan.planning.amounts import Amount
-
-_DEFAULT = 15
 
 
 def amount_options(command: Any) -> Any:
@@ -59,7 +58,7 @@ def amount_options(command: Any) -> Any:
                 return filled if exchange is None else filled.replace(exchange=exchange)
             if empty:
                 return Empty() if remaining is None else Empty(remaining / 100.0)
-            return Loads(_DEFAULT if loads is None else loads)
+            return Loads(DEFAULT_LOADS if loads is None else loads)
 
         return command(amount=amount, **others)
 
@@ -74,7 +73,7 @@ _OPTIONS = (
         "--loads",
         type=click.IntRange(1, MOST_LOADS),
         default=None,
-        help=f"Number of bucket loads. Default: {_DEFAULT}, if no other amount is given.",
+        help=f"Number of bucket loads. Default: {DEFAULT_LOADS}, if no other amount is given.",
     ),
     click.option(
         "--tonnes",

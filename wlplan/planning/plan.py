@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from wlplan.checks import check_plan
+from wlplan.constants import DEFAULT_LOADS
 from wlplan.errors import InputError
 from wlplan.planning import planners
 from wlplan.planning.amounts import Amount, Loads, Made, Tonnes, Trucks, typical_load
@@ -111,7 +112,7 @@ def plan_loads(
         KeyboardInterrupt: If there was no plan yet.
     """
     if amount is None:
-        amount = Loads(15 if loads is None else loads)
+        amount = Loads(DEFAULT_LOADS if loads is None else loads)
     elif loads is not None:
         raise InputError("both loads and an amount are given: give one of them.")
     if objective is None:

@@ -79,7 +79,8 @@ def plan_document(
     if predicted is not None:
         total = {"predicted": totals(predicted, predicted_cost), **total}
     if deviation is not None:
-        total["deviation"] = {name: _root(getattr(deviation, name)) for name in QUANTITIES}
+        # Models err in the same way in many loads: so what the sum may be off by at most.
+        total["deviation"] = {name: _sum(getattr(deviation, name)) for name in QUANTITIES}
     ways: dict[str, Any] = (
         {} if simulated.ways is None else {"paths": paths_of(before, simulated, site)}
     )
@@ -330,11 +331,6 @@ def write_plan_folder(
     for name, content in more.items():
         write_bytes_atomic(folder / name, content)
     return [REPORT_NAME, "plan.json", "plan.png", "totals.png", *more]
-
-
-def _root(values: Any) -> float:
-    """The deviation of a sum of what errs independently."""
-    return float(np.sqrt(np.square(np.asarray(values, np.float64)).sum()))
 
 
 def _sum(values: Any) -> float:

@@ -54,7 +54,7 @@ def headline(document: Mapping[str, Any], part: str = "simulated") -> dict[str, 
 def foreseen(document: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     """What was foreseen of the whole job, and half of the interval that holds nine in ten.
 
-    The interval is that of the ensemble alone, errors of loads taken as independent: of digging,
+    The interval is that of the ensemble alone, all loads taken to err in the same way: of digging,
     not of driving, nor of the litres that a megajoule takes.
 
     Args:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from wlplan.constants import (
+    DEFAULT_LOADS,
     EXCHANGES,
     MOST_LOADS,
     MOST_REMAINING,
@@ -24,7 +25,6 @@ from wlplan.planning.objectives import OBJECTIVES
 if TYPE_CHECKING:
     from wlplan.planning.amounts import Amount
 
-_DEFAULT_LOADS = 15
 _UPS = ("x", "y", "z", "-x", "-y", "-z")
 _LONGEST = 200
 
@@ -262,7 +262,7 @@ def amount_of(settings: Mapping[str, Any]) -> Amount:
         return filled.replace(exchange=given["exchange"]) if "exchange" in given else filled
     if "empty" in given:
         return Empty(given["remaining"] / 100.0) if "remaining" in given else Empty()
-    return Loads(given.get("loads", _DEFAULT_LOADS))
+    return Loads(given.get("loads", DEFAULT_LOADS))
 
 
 def finite(value: object) -> float | None:

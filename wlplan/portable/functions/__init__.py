@@ -83,6 +83,24 @@ PERFORMANCE = (
 """What a loading yields and costs."""
 
 
+def over_grid(name: str, meaning: str, pile: Pile, unit: str = "m") -> Port:
+    """A map with the grid of a pile."""
+    cell = (
+        f"cell [i, j] is centred at x = origin[0] + i * {pile.cell_size:g} m, "
+        f"y = origin[1] + j * {pile.cell_size:g} m"
+    )
+    return Port(name, f"{meaning}: {cell}", unit, "world", pile.height.shape)
+
+
+ORIGIN = Port("origin", "x and y of the centre of cell [0, 0]", "m", "world", (2,))
+"""Where the grid of a pile lies."""
+
+
+def for_each(asked: Asked, values: Any) -> np.ndarray:
+    """The same value for each case."""
+    return np.repeat(np.asarray(values, np.float32)[None], asked.count, axis=0)
+
+
 def local_map(name: str, cells: int, displacement: float) -> Port:
     """A local heightmap as an input."""
     return Port(

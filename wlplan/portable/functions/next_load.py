@@ -9,7 +9,7 @@ from jaxtyping import Array
 from wlplan.planning.placement import beside
 from wlplan.planning.replanning import next_load
 from wlplan.portable.function import Port, PortableFunction, checksum
-from wlplan.portable.functions import PERFORMANCE, Asked
+from wlplan.portable.functions import ORIGIN, PERFORMANCE, Asked, for_each, over_grid
 from wlplan.site.receiver import Receiver
 from wlplan.types import Pile, action_vector
 
@@ -17,17 +17,12 @@ from wlplan.types import Pile, action_vector
 def portable(asked: Asked) -> PortableFunction:
     """The next load, from piles with the grid of the pile."""
     pile, world = asked.pile, asked.world
-    grid = pile.height.shape
-    cell = (
-        f"cell [i, j] is centred at x = origin[0] + i * {pile.cell_size:g} m, "
-        f"y = origin[1] + j * {pile.cell_size:g} m"
-    )
     place = "x [m], y [m] and heading [rad], counter-clockwise from +x"
     inputs = (
-        Port("height", f"surface of pile and terrain: {cell}", "m", "world", grid),
-        Port("ground", "what cannot be moved: floor under the pile, and walls", "m", "world", grid),
-        Port("valid", "1 where the scan saw the cell, else 0", "1", "world", grid),
-        Port("origin", "x and y of the centre of cell [0, 0]", "m", "world", (2,)),
+        over_grid("height", "surface of pile and terrain", pile),
+        over_grid("ground", "what cannot be moved, the floor under the pile and walls", pile),
+        over_grid("valid", "1 where the scan saw the cell, else 0", pile, "1"),
+        ORIGIN,
         Port(
             "receiver",
             f"of the middle of the loader as it dumps: {place}",
@@ -60,11 +55,7 @@ def portable(asked: Asked) -> PortableFunction:
 
     placed = beside(asked.site, pile, asked.contour).placed_receiver
     at = np.array([float(leaf) for leaf in (placed.x, placed.y, placed.heading)], np.float32)
-    seen = np.ones(grid) if pile.valid is None else np.asarray(pile.valid)
-
-    def each(values: Array | np.ndarray) -> np.ndarray:
-        one = np.asarray(values, np.float32)
-        return np.repeat(one[None], asked.count, axis=0)
+    seen = np.ones(pile.height.shape) if pile.valid is None else np.asarray(pile.valid)
 
     return PortableFunction(
         name="next-load",
@@ -72,6 +63,8 @@ def portable(asked: Asked) -> PortableFunction:
         function=function,
         inputs=inputs,
         outputs=outputs,
-        cases=(each(pile.height), each(pile.floor), each(seen), each(pile.origin), each(at)),
+        cases=tuple(
+            for_each(asked, value) for value in (pile.height, pile.floor, seen, pile.origin, at)
+        ),
         origin={**asked.origin, "cell_size": pile.cell_size, "sha256": checksum(world)},
     )

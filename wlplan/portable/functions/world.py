@@ -6,22 +6,26 @@ import numpy as np
 from jaxtyping import Array
 
 from wlplan.portable.function import Port, PortableFunction, checksum
-from wlplan.portable.functions import ACTION, PERFORMANCE, Asked, actions, poses
+from wlplan.portable.functions import (
+    ACTION,
+    ORIGIN,
+    PERFORMANCE,
+    Asked,
+    actions,
+    for_each,
+    over_grid,
+    poses,
+)
 from wlplan.types import Pile, Pose, action_from
 
 
 def portable(asked: Asked) -> PortableFunction:
     """The world, over piles with the grid of the pile."""
     pile, world = asked.pile, asked.world
-    grid = pile.height.shape
-    cell = (
-        f"cell [i, j] is centred at x = origin[0] + i * {pile.cell_size:g} m, "
-        f"y = origin[1] + j * {pile.cell_size:g} m"
-    )
     inputs = (
-        Port("height", f"surface of pile and terrain: {cell}", "m", "world", grid),
-        Port("ground", "what cannot be moved: floor under the pile", "m", "world", grid),
-        Port("origin", "x and y of the centre of cell [0, 0]", "m", "world", (2,)),
+        over_grid("height", "surface of pile and terrain", pile),
+        over_grid("ground", "what cannot be moved, the floor under the pile", pile),
+        ORIGIN,
         Port(
             "pose",
             "x [m] and y [m] of the dig location at the toe, and the heading into the pile [rad], "
@@ -32,7 +36,7 @@ def portable(asked: Asked) -> PortableFunction:
         ),
         ACTION,
     )
-    outputs = (Port("height_after", "surface after the loading", "m", "world", grid), *PERFORMANCE)
+    outputs = (over_grid("height_after", "surface after the loading", pile), *PERFORMANCE)
 
     def function(
         height: Array, ground: Array, origin: Array, pose: Array, action: Array
@@ -43,10 +47,6 @@ def portable(asked: Asked) -> PortableFunction:
 
     where = poses(asked)
 
-    def each(values: Array) -> np.ndarray:
-        one = np.asarray(values, np.float32)
-        return np.repeat(one[None], asked.count, axis=0)
-
     return PortableFunction(
         name="world",
         meaning="what one loading yields and costs, and what it leaves of the pile",
@@ -54,9 +54,9 @@ def portable(asked: Asked) -> PortableFunction:
         inputs=inputs,
         outputs=outputs,
         cases=(
-            each(pile.height),
-            each(pile.floor),
-            each(pile.origin),
+            for_each(asked, pile.height),
+            for_each(asked, pile.floor),
+            for_each(asked, pile.origin),
             np.stack([where.x, where.y, where.heading], axis=1),
             actions(asked),
         ),

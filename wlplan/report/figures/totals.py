@@ -114,11 +114,11 @@ def _draw_band(
     deviation: Float[np.ndarray, " n"],
     accumulated: bool,
 ) -> None:
-    """What holds nine in ten around what was predicted; the errors of loads are independent."""
+    """What holds nine in ten around what was predicted; all loads err in the same way."""
     half = PERCENT_90 * deviation
     if accumulated:
         values = np.append(0.0, np.cumsum(values))
-        half = np.append(0.0, np.sqrt(np.cumsum(half**2)))
+        half = np.append(0.0, np.cumsum(half))
     panel.fill_between(
         load, values - half, values + half, color=BLUE, alpha=0.22, linewidth=0.0, label=BAND
     )
