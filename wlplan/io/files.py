@@ -114,7 +114,8 @@ def atomic_folder(
         # Twice: an interrupt may cut the first short.
         at_end.callback(_remove_folder, temporary)
         at_end.callback(_remove_folder, temporary)
-        place.parent.mkdir(parents=True, exist_ok=True)
+        if missing:
+            place.parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir(0o700)
         yield temporary
         temporary.chmod(0o777 & ~_mask())
