@@ -1,8 +1,10 @@
 """Loading cycles simulated by the discrete-element engine: the recipe of a reference data set.
 
 Piles are planes, cones and wedges of 20 to 30 degrees with low bumps; each is dug twice, the second
-time where the first loading left its toe. Every cycle is drawn from the seed and its own number, so
-a file that was begun is gone on with, and grows by one cycle at a time.
+time where the first loading left its toe. With `--lane ridge` each is dug once, over a ridge that
+lies in the approach lane, and with `--lane free` by the same actions without it. Every cycle is
+drawn from the seed and its own number, so a file that was begun is gone on with, and grows by one
+cycle at a time.
 """
 
 from __future__ import annotations
@@ -45,25 +47,37 @@ _WAVES, _WAVE_NUMBER, _FULL = 6, 1.6, 0.5
 # The second loading begins this far before the pile is as high as a toe, on average over the
 # bucket's width [m].
 _BEFORE_TOE, _TOE = 0.15, 0.15
+LANES = ("short", "ridge", "free")
+"""What the cycles have of the approach lane: its end, all of it with a ridge, or all of it free."""
+# Rows of a map that reaches back to where the approach begins.
+_LANE_ROWS = 126
+# Ridges: height and length [m], slope of their sides [rad], direction against across the lane
+# [rad], and distance of the crest before the dig location and of the foot from its other end [m].
+_RIDGE_HEIGHT, _RIDGE_LENGTH = (0.2, 0.6), (1.5, 4.0)
+_RIDGE_SLOPE, _RIDGE_TURN = math.radians(28.0), math.radians(60.0)
+_RIDGE_NEAREST, _LANE_END = 1.0, 4.6
 # Maps are saved as multiples of this [m].
 _UNIT = 1e-3
 # Longest record of a cycle that is saved, in rows of 0.04 s.
 _ROWS = 640
 
 
-def seed_surface(rng: np.random.Generator, shape: str) -> tuple[np.ndarray, dict[str, float]]:
+def seed_surface(
+    rng: np.random.Generator, shape: str, rows: int = columns.CELLS
+) -> tuple[np.ndarray, dict[str, float]]:
     """A pile in the frame of its dig location on the grid of `wlplan.engines.dem.columns`.
 
     Args:
         rng: Source of its slope, direction and bumps.
         shape: One of `SHAPES`.
+        rows: Of the map.
 
     Returns:
         Heights [m], and what was drawn: slope and incidence [degree], bumps [m].
     """
     slope, incidence = rng.uniform(*_SLOPE), rng.uniform(*_INCIDENCE)
     bumps = rng.uniform(*_BUMPS)
-    x, y = np.meshgrid(*columns.axes(), indexing="ij")
+    x, y = np.meshgrid(*columns.axes(rows), indexing="ij")
     ahead = x * math.cos(incidence) + y * math.sin(incidence)
     aside = -x * math.sin(incidence) + y * math.cos(incidence)
     if shape == "cone":
@@ -82,6 +96,35 @@ def seed_surface(rng: np.random.Generator, shape: str) -> tuple[np.ndarray, dict
         "bumps_m": bumps,
     }
     return np.clip(height + waves, 0.0, _HIGHEST), drawn
+
+
+def ridge(rng: np.random.Generator) -> tuple[np.ndarray, dict[str, float]]:
+    """A ridge of soil in the approach lane, on a level floor.
+
+    Args:
+        rng: Source of its height, length, direction and place.
+
+    Returns:
+        Heights on the grid of `wlplan.engines.dem.columns` with the rows of the lane [m], and what
+        was drawn: height, length, distance and offset to the left [m], turn [degree].
+    """
+    high, length = rng.uniform(*_RIDGE_HEIGHT), rng.uniform(*_RIDGE_LENGTH)
+    turn, left = rng.uniform(-_RIDGE_TURN, _RIDGE_TURN), rng.uniform(-0.7, 0.7)
+    foot = high / math.tan(_RIDGE_SLOPE)
+    before = rng.uniform(_RIDGE_NEAREST, _LANE_END - foot)
+    x, y = np.meshgrid(*columns.axes(_LANE_ROWS), indexing="ij")
+    across = math.cos(turn) * (x + before) + math.sin(turn) * (y - left)
+    along = -math.sin(turn) * (x + before) + math.cos(turn) * (y - left)
+    # It ends as steeply as its sides.
+    away = np.hypot(across, np.maximum(np.abs(along) - 0.5 * length, 0.0))
+    drawn = {
+        "ridge_m": high,
+        "ridge_length_m": length,
+        "ridge_before_m": before,
+        "ridge_left_m": left,
+        "ridge_turn_deg": math.degrees(turn),
+    }
+    return np.maximum(high - math.tan(_RIDGE_SLOPE) * away, 0.0), drawn
 
 
 def at_new_toe(height: np.ndarray, width: float) -> np.ndarray:
@@ -107,7 +150,7 @@ def action_of(rng: np.random.Generator) -> np.ndarray:
 
 
 def next_cycle(
-    seed: int, number: int, repeats: int, done: Sequence[dict[str, Any]]
+    seed: int, number: int, repeats: int, done: Sequence[dict[str, Any]], lane: str = "short"
 ) -> tuple[np.ndarray, np.ndarray, int, dict[str, Any]]:
     """Surface, action, packing and origin of a cycle.
 
@@ -117,7 +160,10 @@ def next_cycle(
         repeats: 0 for two loadings of each pile; otherwise every first loading is simulated with so
             many packings.
         done: Rows of the cycles before.
+        lane: One of `LANES`; unless it is "short", every pile is loaded from once.
     """
+    if lane != "short":
+        return _lane_cycle(seed, number, lane == "ridge")
     each = repeats or 2
     pile, turn = divmod(number, each)
     rng = np.random.default_rng([seed, pile])
@@ -139,6 +185,26 @@ def next_cycle(
         "shape": shape,
     }
     return surface, action, packing, origin
+
+
+def _lane_cycle(
+    seed: int, number: int, is_there: bool
+) -> tuple[np.ndarray, np.ndarray, int, dict[str, Any]]:
+    """As `next_cycle`, with all of the approach lane; the same cycle with and without its ridge."""
+    rng = np.random.default_rng([seed, number])
+    shape = SHAPES[number % len(SHAPES)]
+    surface, drawn = seed_surface(rng, shape, _LANE_ROWS)
+    action = action_of(rng)
+    heap, of_ridge = ridge(rng)
+    origin = {
+        **drawn,
+        **of_ridge,
+        "pile_id": f"{seed}-{number}",
+        "cycle_in_pile": 0,
+        "packing": number,
+        "shape": shape,
+    }
+    return np.maximum(surface, heap) if is_there else surface, action, number, origin
 
 
 def row_of(cycle: CycleRecord, action: np.ndarray, origin: dict[str, Any]) -> dict[str, Any]:
@@ -212,7 +278,7 @@ def write_rows(path: Path, rows: Sequence[dict[str, Any]], recipe: dict[str, Any
     fields = {name: np.array([row[name] for row in rows]) for name in rows[0]}
     longest = int((~np.isnan(fields["traj"][:, :, 0])).sum(axis=1).max())
     fields["traj"] = fields["traj"][:, :longest]
-    x, y = columns.axes()
+    x, y = columns.axes(fields["h0"].shape[1])
     content = io.BytesIO()
     np.savez_compressed(
         content,
@@ -229,7 +295,9 @@ def write_rows(path: Path, rows: Sequence[dict[str, Any]], recipe: dict[str, Any
     write_bytes_atomic(path, content.getvalue())
 
 
-def collect(path: Path, *, seed: int, cycles: int, repeats: int, machine: str) -> int:
+def collect(
+    path: Path, *, seed: int, cycles: int, repeats: int, machine: str, lane: str = "short"
+) -> int:
     """Simulates cycles until a file has as many as are wanted; a line on stderr for each.
 
     Args:
@@ -238,6 +306,7 @@ def collect(path: Path, *, seed: int, cycles: int, repeats: int, machine: str) -
         cycles: How many the file shall have.
         repeats: As of `next_cycle`.
         machine: A name of `MACHINES`.
+        lane: One of `LANES`.
 
     Returns:
         How many were simulated.
@@ -247,10 +316,12 @@ def collect(path: Path, *, seed: int, cycles: int, repeats: int, machine: str) -
     """
     digs: WheelLoader = MACHINES[machine]
     recipe = {"seed": seed, "repeats": repeats, "machine": dataclasses.asdict(digs)}
+    if lane != "short":
+        recipe["lane"] = lane
     rows = read_rows(path, recipe)
     begun = len(rows)
     for number in range(begun, cycles):
-        surface, action, packing, origin = next_cycle(seed, number, repeats, rows)
+        surface, action, packing, origin = next_cycle(seed, number, repeats, rows, lane)
         cycle = process.play(
             surface, action, machine=digs, soil=GRAVEL, settings=DemSettings(packing=packing)
         )
@@ -276,6 +347,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=0,
         help="packings in which each pile and action is simulated, instead of two loadings a pile",
     )
+    parser.add_argument(
+        "--lane",
+        choices=LANES,
+        default="short",
+        help="what the cycles have of the approach lane; with `ridge` and `free`, all of it",
+    )
     parser.add_argument("--machine", choices=MACHINES, default="reference", help="what digs")
     options = parser.parse_args(arguments)
     try:
@@ -285,6 +362,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             cycles=options.cycles,
             repeats=max(options.repeats, 0),
             machine=options.machine,
+            lane=options.lane,
         )
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")

@@ -11,12 +11,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jax import lax
+from jaxtyping import Array, Float, Int
 
 from wlplan.constants import CELL_SIZE, J_PER_KJ
 from wlplan.dataset.protocol import Episode
 from wlplan.engines.simulator import Simulator
 from wlplan.engines.simulator.cycle import State, advance, begin, outcome
+from wlplan.engines.simulator.lane import begin_in_lane, go_on, lane_of
 from wlplan.terrain.characteristics import as_vector, characteristics
 from wlplan.terrain.heightmap import (
     PERFORMANCE_CELLS,
@@ -35,6 +37,8 @@ _SLOTS = 32
 # Time steps after which ended cycles make room for others. A cycle takes about 170 and waits half
 # of these; more of them make fewer calls.
 _STEPS = 10
+# What a slot is at: under way, at the end of its cycle, or at the end of its approach lane.
+_UNDER_WAY, _AT_END, _THROUGH_LANE = 0, 1, 2
 
 
 class VectorSimulator:
@@ -62,16 +66,24 @@ class VectorSimulator:
         self.states = _idle(simulator)
         self.slots: list[Episode | None] = [None] * _SLOTS
         self.views: list[Array] = [jnp.zeros(0)] * _SLOTS
+        # Soil in the lanes, and once a cycle is through its lane what that has changed of it.
+        self.lanes: list[Array] = [jnp.zeros(0)] * _SLOTS
 
     def run(self) -> None:
         """Simulates episodes until there are no more, or it is stopped."""
         for slot in range(_SLOTS):
             self._fill(slot)
         while any(self.slots) and not self.stopped.is_set():
-            self.states, ended = self.programs.advance(self.states)
-            for slot, has_ended in enumerate(np.asarray(ended).tolist()):
-                if has_ended and self.slots[slot] is not None:
+            self.states, stages = self.programs.advance(self.states)
+            for slot, stage in enumerate(np.asarray(stages).tolist()):
+                if stage == _UNDER_WAY or self.slots[slot] is None:
+                    continue
+                if stage == _AT_END:
                     self._empty(slot)
+                else:
+                    self.states, self.lanes[slot] = self.programs.go_on(
+                        self.states, slot, self.views[slot], self.lanes[slot]
+                    )
 
     def _fill(self, slot: int) -> None:
         """Puts the next loading of a slot's episode there, or the first of another."""
@@ -82,7 +94,7 @@ class VectorSimulator:
                 return
             episode.reset()
         pose, action = episode.next_loading()
-        self.states, self.views[slot] = self.programs.enter(
+        self.states, self.views[slot], self.lanes[slot] = self.programs.enter(
             self.states, slot, episode.origin, episode.height, pose, action
         )
 
@@ -91,7 +103,8 @@ class VectorSimulator:
         episode = self.slots[slot]
         assert episode is not None
         height, maps, numbers = self.programs.leave(
-            self.states, slot, episode.origin, episode.height, episode.pose, self.views[slot]
+            *(self.states, slot, episode.origin, episode.height, episode.pose),
+            *(self.views[slot], self.lanes[slot]),
         )
         episode.add_loading(height, jax.tree.map(np.asarray, maps) | _named(np.asarray(numbers)))
         self.report(None)
@@ -147,8 +160,8 @@ def _idle(simulator: Simulator) -> _States:
     return tuple(jnp.array(part, copy=True) for part in states)
 
 
-def _advance(simulator: Simulator, states: _States) -> tuple[_States, Bool[Array, " b"]]:
-    """Some time steps further, and which cycles have ended."""
+def _advance(simulator: Simulator, states: _States) -> tuple[_States, Int[Array, " b"]]:
+    """Some time steps further, and what each slot is at."""
     state = advance(
         _unpack(simulator, states),
         machine=simulator.machine,
@@ -156,7 +169,8 @@ def _advance(simulator: Simulator, states: _States) -> tuple[_States, Bool[Array
         settings=simulator.settings,
         steps=_STEPS,
     )
-    return _pack(state), state.has_ended
+    at_end = jnp.where(state.dig_x > 0.0, _THROUGH_LANE, _AT_END)
+    return _pack(state), jnp.where(state.has_ended, at_end, _UNDER_WAY)
 
 
 def _enter(
@@ -167,12 +181,40 @@ def _enter(
     height: Float[Array, "nx ny"],
     pose: Float[Array, "3"] | np.ndarray,
     action: Float[Array, "4"] | np.ndarray,
+) -> tuple[_States, Float[Array, "52 52"], Float[Array, "52 52"]]:
+    """The slots with a new loading in one of them, its surface, and the soil in its lane.
+
+    Both in the local frame.
+    """
+    pile, dig_pose = Pile(height, CELL_SIZE, origin), Pose(*pose)
+    view, _ = simulator.view(pile, dig_pose)
+    lane, is_met = lane_of(pile, dig_pose, simulator.machine)
+    one = Action(*(part[None] for part in action))
+    begun = lax.cond(
+        is_met,
+        lambda: begin_in_lane(lane[..., None], is_met[None], one, simulator.machine),
+        lambda: _begin(simulator, view[..., None], one),
+    )
+    return _put(states, slot, begun), view, lane
+
+
+def _put(states: _States, slot: Int[Array, ""] | int, begun: State) -> _States:
+    pairs = zip(states, _pack(begun), strict=True)
+    return tuple(all_.at[..., slot].set(new[..., 0]) for all_, new in pairs)
+
+
+def _go_on(
+    simulator: Simulator,
+    states: _States,
+    slot: Int[Array, ""] | int,
+    view: Float[Array, "52 52"],
+    lane: Float[Array, "52 52"],
 ) -> tuple[_States, Float[Array, "52 52"]]:
-    """The slots with a new loading in one of them, and its surface in the local frame."""
-    view, _ = simulator.view(Pile(height, CELL_SIZE, origin), Pose(*pose))
-    one = _pack(_begin(simulator, view[..., None], Action(*(part[None] for part in action))))
-    entered = (all_.at[..., slot].set(new[..., 0]) for all_, new in zip(states, one, strict=True))
-    return tuple(entered), view
+    """The slots with one of them through its lane, and what that has changed there."""
+    one = _unpack(simulator, tuple(part[..., slot][..., None] for part in states))
+    main = _begin(simulator, view[..., None], one.action)
+    begun, change = go_on(one, lane[..., None], main, simulator.machine)
+    return _put(states, slot, begun), change[..., 0]
 
 
 def _leave(
@@ -183,11 +225,12 @@ def _leave(
     height: Float[Array, "nx ny"],
     pose: Float[Array, "3"] | np.ndarray,
     view: Float[Array, "52 52"],
+    lane: Float[Array, "52 52"],
 ) -> tuple[Float[Array, "nx ny"], dict[str, Array], Float[Array, " k"]]:
     """The surface after the loading of one slot, the local maps, and the numbers of `_named`."""
     one = _unpack(simulator, tuple(part[..., slot][..., None] for part in states))
     cycles = outcome(one, machine=simulator.machine, soil=simulator.soil)
-    cycle = jax.tree.map(lambda part: part[..., 0], cycles)
+    cycle = jax.tree.map(lambda part: part[..., 0], cycles).replace(lane_change=lane)
     pile, dig_pose = Pile(height, CELL_SIZE, origin), Pose(*pose)
     after, performance, _ = simulator.leave(pile, dig_pose, view, cycle)
 
@@ -232,19 +275,25 @@ def _named(numbers: Float[np.ndarray, " k"]) -> dict[str, Any]:
 
 
 class _Programs(NamedTuple):
-    """`_advance`, `_enter` and `_leave` of one simulator, compiled."""
+    """`_advance`, `_enter`, `_go_on` and `_leave` of one simulator, compiled."""
 
-    advance: Callable[..., tuple[_States, Bool[Array, " b"]]]
-    enter: Callable[..., tuple[_States, Float[Array, "52 52"]]]
+    advance: Callable[..., tuple[_States, Int[Array, " b"]]]
+    enter: Callable[..., tuple[_States, Float[Array, "52 52"], Float[Array, "52 52"]]]
+    go_on: Callable[..., tuple[_States, Float[Array, "52 52"]]]
     leave: Callable[..., tuple[Float[Array, "nx ny"], dict[str, Array], Float[Array, " k"]]]
 
 
 @functools.cache
 def _programs(simulator: Simulator) -> _Programs:
     # Bound to their simulator, for JAX takes 0.2 ms a call to look at it.
-    bound = (functools.partial(function, simulator) for function in (_advance, _enter, _leave))
-    advance_, enter, leave = bound
+    def compiled(function: Callable[..., Any], **how: Any) -> Callable[..., Any]:
+        program: Callable[..., Any] = jax.jit(functools.partial(function, simulator), **how)
+        return program
+
     # The slots are changed where they are.
     return _Programs(
-        jax.jit(advance_, donate_argnums=0), jax.jit(enter, donate_argnums=0), jax.jit(leave)
+        compiled(_advance, donate_argnums=0),
+        compiled(_enter, donate_argnums=0),
+        compiled(_go_on, donate_argnums=0),
+        compiled(_leave),
     )

@@ -13,7 +13,7 @@ from wlplan.engines.dem import columns
 from wlplan.engines.dem.bucket import PLATE_RADIUS, plate_spheres, section_of
 from wlplan.engines.dem.engine import Engine, open_box
 from wlplan.engines.dem.grains import DemSettings
-from wlplan.engines.dem.loader import FREE, RECORDED, BucketForce, Loader
+from wlplan.engines.dem.loader import FREE, RECORDED, START, BucketForce, Loader
 from wlplan.engines.dem.packing import Bed, Walls, cut, in_lane
 from wlplan.site.machine import WheelLoader
 from wlplan.site.soil import Soil
@@ -79,7 +79,8 @@ def play_cycle(
 
     Args:
         bed: What the pile is cut from.
-        surface: Height of the soil over a level floor on the grid of `columns` [m].
+        surface: Height of the soil over a level floor on a grid of `columns` [m]. The more rows it
+            has, the further behind the dig location the bucket enters.
         action: delta_bm, k_bm, delta_bk, k_bk.
         machine: What digs.
         soil: What is dug: its density, and its friction on steel.
@@ -92,21 +93,27 @@ def play_cycle(
     density = soil.density / bed.packing
     step = settings.time_step(soil.density)
     plates = plate_spheres(machine)
-    box = _space(machine, plates, walls)
+    rows = len(surface)
+    enters = START - columns.further(rows)
+    box = _space(machine, plates, walls, enters)
     rest = _Rest(settings, walls, box, density, step)
     centre, radius = rest(*cut(bed, surface, walls, settings.packing), *_AFTER_CUT)
-    blocked = in_lane(centre, machine.bucket_width)
+    blocked = in_lane(centre, machine.bucket_width, rows)
     bulk = 4.0 / 3.0 * math.pi / bed.packing
     cleared = bulk * float((radius[blocked] ** 3).sum())
     centre, radius = centre[~blocked], radius[~blocked]
-    before = columns.column_height(centre, radius, bed.packing)
-    seen_before = columns.envelope(centre, radius)
+    before = columns.column_height(centre, radius, bed.packing, rows)
+    seen_before = columns.envelope(centre, radius, rows)
 
     # The machine moves once in about 4 ms, however long the engine's steps are.
     steps = max(5, 5 * round(_CONTROL / step / 5.0))
-    x, _ = columns.axes()
+    x, _ = columns.axes(rows)
     profile = columns.centre_line(seen_before)
-    loader = Loader(machine, action, lambda at: float(np.interp(at, x, profile)), steps * step)
+
+    def surface_at(along: float) -> float:
+        return float(np.interp(along, x, profile))
+
+    loader = Loader(machine, action, surface_at, steps * step, enters)
     start = loader.linkage.points(loader.position, loader.boom, loader.tilt, plates)
     with Engine(
         np.concatenate([centre, start]),
@@ -142,18 +149,20 @@ def play_cycle(
         cleared=cleared,
         lost=lost,
         before=before,
-        after=columns.column_height(left, left_radius, bed.packing),
+        after=columns.column_height(left, left_radius, bed.packing, rows),
         envelope_before=seen_before,
-        envelope_after=columns.envelope(left, left_radius),
+        envelope_after=columns.envelope(left, left_radius, rows),
         record=record,
     )
 
 
-def _space(machine: WheelLoader, plates: np.ndarray, walls: Walls) -> np.ndarray:
+def _space(
+    machine: WheelLoader, plates: np.ndarray, walls: Walls, enters: float = START
+) -> np.ndarray:
     """Space in which the bucket stays, wherever it is turned to, with a metre around it [m]."""
     reach = float(np.hypot(plates[:, 0], plates[:, 2]).max()) + machine.tip_radius
     top = machine.pivot_height + machine.boom_length + reach
-    return open_box(walls, FREE - reach - 1.0, top + 1.0)
+    return open_box(walls, min(FREE, enters) - reach - 1.0, top + 1.0)
 
 
 def _dig(engine: Engine, loader: Loader, plates: np.ndarray) -> np.ndarray:

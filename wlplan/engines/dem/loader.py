@@ -32,7 +32,8 @@ from wlplan.site.machine import WheelLoader
 
 _TILT_END, _PENETRATION, _BREAKOUT, _TIMEOUT = STOP_REASONS
 
-# Where the cycle enters and leaves the engine: position of the cutting edge [m].
+# Where the cycle enters the engine, if the lane is free, and leaves it: position of the cutting
+# edge [m].
 START, FREE = -0.70, -1.90
 # A cycle that takes longer is given up [s]; filling ends after `MAX_FILL_TIME`.
 MAX_TIME = 40.0
@@ -126,6 +127,7 @@ class Loader:
         surface: `surface(x)`: height of the initial surface on the centre line [m]; the edge above
             it is what ends filling by breakout.
         step: Time between two calls of `advance` [s].
+        start: Where the cycle enters the engine [m].
     """
 
     def __init__(
@@ -134,12 +136,13 @@ class Loader:
         action: np.ndarray,
         surface: Callable[[float], float],
         step: float,
+        start: float = START,
     ):
         self.machine, self.linkage, self.step = machine, Linkage(machine), step
         self._action, self._surface = [float(value) for value in action], surface
-        travelled = machine.approach_distance + START
+        travelled = machine.approach_distance + start
         self.time = travelled / machine.travel_speed
-        self.position, self.boom, self.tilt = START, machine.boom_low, 0.0
+        self.position, self.boom, self.tilt = start, machine.boom_low, 0.0
         self.speed, self.boom_rate, self.tilt_rate = machine.travel_speed, 0.0, 0.0
         self.work_drive = machine.rolling_resistance * machine.mass * GRAVITY * travelled
         self.work_boom = self.work_bucket = self.work_slip = 0.0
@@ -227,8 +230,14 @@ class Loader:
 
     def _commands(self, force: float, tip: tuple[float, float]) -> tuple[float, float]:
         """Wanted speeds of boom and bucket, in parts of their maxima; the sequence of phases."""
-        if self.phase is Phase.APPROACH and tip[0] >= 0.0:
-            self.phase, self.dig_time = Phase.FILLING, self.time
+        if self.phase is Phase.APPROACH:
+            # In a free lane the edge is at the dig location by then. Stuck in one that is not, the
+            # cycle ends as a filling does that takes too long.
+            free = self.machine.approach_distance / self.machine.travel_speed
+            if tip[0] >= 0.0:
+                self.phase, self.dig_time = Phase.FILLING, self.time
+            elif self.time - free > MAX_FILL_TIME:
+                self.phase, self.dig_time = Phase.FILLING, free
         if self.phase is Phase.FILLING:
             self.stop_reason = self._reason_to_stop(tip)
             if self.stop_reason:

@@ -42,7 +42,7 @@ class Bed:
         return float(volume / self.packing / self.lengths.prod()) - 0.5 * float(self.radius.max())
 
 
-# The domain begins here, behind the bucket [m].
+# The domain begins here, behind the bucket [m]; behind that of a map with more rows likewise.
 BEHIND = -1.9
 # The lane in which the bucket starts: it ends here [m], and is this much wider than the bucket on
 # either side. Soil in it would overlap the bucket.
@@ -58,22 +58,24 @@ def cut(bed: Bed, surface: np.ndarray, walls: Walls, packing: int) -> tuple[np.n
 
     Args:
         bed: Bed to cut from.
-        surface: Height of the soil over the floor on the grid of `columns` [m].
-        walls: Where the domain ends; nothing is cut behind `BEHIND`.
+        surface: Height of the soil over the floor on a grid of `columns` [m].
+        walls: Where the domain ends.
         packing: Which part of the bed the spheres come from, and whether it is mirrored.
 
     Returns:
         Centres [m], shape [n, 3], and radii [m], shape [n], in the frame of the dig location.
     """
-    centre, radius = _spread(bed, walls, packing)
+    rows = len(surface)
+    centre, radius = _spread(bed, walls, packing, BEHIND - columns.further(rows))
     capped = np.clip(surface, 0.0, bed.top)
-    over = map_coordinates(capped, columns.cells_of(*centre[:, :2].T), order=1, mode="nearest")
+    places = columns.cells_of(centre[:, 0], centre[:, 1], rows)
+    over = map_coordinates(capped, places, order=1, mode="nearest")
     mean = bed.radius.mean()
     below = (centre[:, 2] < over + _LIFT * mean) & (over > _THIN * mean)
     return centre[below], radius[below]
 
 
-def _spread(bed: Bed, walls: Walls, packing: int) -> tuple[np.ndarray, np.ndarray]:
+def _spread(bed: Bed, walls: Walls, packing: int, behind: float) -> tuple[np.ndarray, np.ndarray]:
     """The bed, moved and perhaps mirrored, repeated as often as fills the domain."""
     rng = np.random.default_rng(packing)
     offset = rng.uniform(0.0, 1.0, 2) * bed.lengths
@@ -82,7 +84,7 @@ def _spread(bed: Bed, walls: Walls, packing: int) -> tuple[np.ndarray, np.ndarra
     centre[:, :2] = (centre[:, :2] + offset) % bed.lengths
     if mirrored:
         centre[:, 1] = bed.lengths[1] - centre[:, 1]
-    low = np.array([BEHIND, walls.right])
+    low = np.array([behind, walls.right])
     size = np.array([walls.ahead, walls.left]) - low
     copies = []
     for i in range(int(np.ceil(size[0] / bed.lengths[0]))):
@@ -92,14 +94,14 @@ def _spread(bed: Bed, walls: Walls, packing: int) -> tuple[np.ndarray, np.ndarra
     radius = np.tile(bed.radius, len(copies))
     centre = np.concatenate(copies)
     gap = 0.85 * radius
-    inside = (centre[:, 0] > BEHIND) & (centre[:, 0] < walls.ahead - gap)
+    inside = (centre[:, 0] > behind) & (centre[:, 0] < walls.ahead - gap)
     inside &= (centre[:, 1] > walls.right + gap) & (centre[:, 1] < walls.left - gap)
     return centre[inside], radius[inside]
 
 
-def in_lane(centre: np.ndarray, width: float) -> np.ndarray:
-    """Which spheres lie where the bucket of a given width [m] starts."""
-    within: np.ndarray = (centre[:, 0] < _LANE_END) & (
+def in_lane(centre: np.ndarray, width: float, rows: int = columns.CELLS) -> np.ndarray:
+    """Which spheres lie where the bucket of a given width [m] starts, on a map of so many rows."""
+    within: np.ndarray = (centre[:, 0] < _LANE_END - columns.further(rows)) & (
         np.abs(centre[:, 1]) < 0.5 * width + _LANE_MARGIN
     )
     return within

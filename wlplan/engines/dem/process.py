@@ -90,7 +90,8 @@ def play(
     """Plays one cycle in the engine, or reads it if it was played before.
 
     Args:
-        surface: Height of the soil over a level floor on the grid of `columns` [m].
+        surface: Height of the soil over a level floor on a grid of `columns` [m], see
+            `cycle.play_cycle`.
         action: delta_bm, k_bm, delta_bk, k_bk.
         machine: What digs.
         soil: What is dug.

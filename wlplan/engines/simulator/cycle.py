@@ -1,11 +1,13 @@
 """One loading cycle on a local heightfield: approach, dig, breakout, retreat. Paper, section 5.
 
 Time marches in fixed steps while the bucket is in the soil; the approach before it and the retreat
-after it have closed forms. An event that ends a phase is located inside its step and the state
-interpolated to it, so that outcomes are continuous in the inputs.
+after it have closed forms. Where soil lies in the approach lane, time marches there too: see
+`lane`. An event that ends a phase is located inside its step and the state interpolated to it, so
+that outcomes are continuous in the inputs.
 
 Cycles are computed side by side, the last axis of every array: `begin` some, `advance` them by a
-few steps at a time, and take each one's `outcome` when it `has_ended`. `dig` does it all for one.
+few steps at a time, and take each one's `outcome` when it `has_ended`. `dig` does it all for one,
+and `lane.dig_from_lane` for one with the lane.
 """
 
 from __future__ import annotations
@@ -69,6 +71,8 @@ class Cycle(struct.PyTreeNode):
     tip_x: Float[Array, ""]  # cutting edge at the stop [m]
     tip_z: Float[Array, ""]
     height: Float[Array, "52 52"]  # local heightfield afterwards, not relaxed [m]
+    # What the approach changes behind that heightfield, see `lane` [m]; None: the lane was free.
+    lane_change: Float[Array, "52 52"] | None = None
 
 
 @no_type_check
@@ -81,6 +85,9 @@ class State(struct.PyTreeNode):
     wall_x: Float[Array, "51 b"]  # faces of walls along the heading; do not change [m]
     wall_top: Float[Array, "51 b"]  # how high they stand; does not change [m]
     action: Action  # does not change
+    # Where the dig location lies in the frame of the heightfield: 0, or ahead, see `lane` [m].
+    dig_x: Float[Array, " b"]
+    taken: Float[Array, " b"]  # of the fill, what was taken up on the approach, at most [m^3]
     fill: Float[Array, "lanes b"]  # soil in each lane of the bucket [m^3]
     time: Float[Array, " b"]
     position: Float[Array, " b"]
@@ -100,19 +107,28 @@ class State(struct.PyTreeNode):
     work_bucket: Float[Array, " b"]
     work_slip: Float[Array, " b"]
     stop_reason: Int[Array, " b"]
-    phase: Int[Array, " b"]  # 0 filling (approach included), 1 stopped, 2 ended
+    phase: Int[Array, " b"]  # 0 filling (approach included), 1 stopped, 2 ended, 3 arrived
 
     @property
     def has_ended(self) -> Bool[Array, " b"]:
         """Whether a further step changes nothing."""
-        return self.phase == _ENDED
+        return self.phase >= _ENDED
+
+    @property
+    def has_arrived(self) -> Bool[Array, " b"]:
+        """Whether it has come through the lane, up to the heightfield of the dig pose."""
+        return self.phase == _ARRIVED
 
     def ended(self) -> State:
         """The same with all cycles at an end."""
         return self.replace(phase=jnp.full_like(self.phase, _ENDED))
 
 
-_FILLING, _STOPPED, _ENDED = 0, 1, 2
+_FILLING, _STOPPED, _ENDED, _ARRIVED = 0, 1, 2, 3
+
+# The pile comes to stand behind the soil that is met over this way before the dig location [m],
+# if so much was taken up in the lane [m^3]; with less in part, so that outcomes are continuous.
+_TOE, _LITTLE = 0.5, 0.1
 
 
 def begin(
@@ -146,6 +162,8 @@ def begin(
         wall_top=wall_top,
         profile=jnp.einsum("ijb,j->ib", height, jnp.asarray(width / width.sum(), dtype)),
         action=jax.tree.map(lambda part: jnp.asarray(part, dtype), action),
+        dig_x=zero,
+        taken=zero,
         fill=jnp.zeros((terrain.Lanes(machine).count, height.shape[2]), dtype),
         time=zero + travelled / machine.travel_speed,
         position=start,
@@ -214,8 +232,11 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     x, z = loader.bucket_tip(machine, state.position, state.boom, state.tilt)
     wall = materialize_if(walls.nearest(state.wall_x, state.wall_top, z), wanted)
     bucket = terrain.Bucket(x, z, state.tilt, wall)
+    backed = 1.0 - jnp.clip(state.taken / _LITTLE, 0.0, 1.0) * jnp.clip(
+        (state.dig_x - x) / _TOE, 0.0, 1.0
+    )
     soil_force = terrain.reaction(
-        machine, soil, state.height, state.ground, state.fill, bucket, wanted
+        machine, soil, state.height, state.ground, state.fill, bucket, wanted, state.taken, backed
     )
     soil_force = materialize_if(soil_force, wanted)
     vertical = soil_force.vertical
@@ -240,7 +261,7 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     boom_force = controller.smooth(state.boom_force, force / machine.boom_force_nominal, step)
     boom_target, tilt_target = controller.command(state.action, boom_force)
     # Engaged when the edge reaches the dig location; a short ramp keeps this continuous.
-    engaged = jnp.clip(x / CELL_SIZE + 0.5, 0.0, 1.0)
+    engaged = jnp.clip((x - state.dig_x) / CELL_SIZE + 0.5, 0.0, 1.0)
     boom_target = jnp.where(filling, engaged * boom_target, 0.0)
     tilt_target = jnp.where(filling, engaged * tilt_target, 1.0)
     boom_command = controller.smooth(state.boom_command, boom_target, step)
@@ -291,14 +312,14 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     # Events: each is a margin that reaches zero.
     def surface_margin(tip_x: Array, tip_z: Array) -> Array:
         surface = _interpolated(state.profile, walls.in_front(tip_x, wall))
-        early = jnp.maximum(BREAKOUT_FROM - tip_x, 0.0)
+        early = jnp.maximum(BREAKOUT_FROM - (tip_x - state.dig_x), 0.0)
         return surface + BREAKOUT_CLEARANCE + early - tip_z
 
     deadline = state.dig_start + MAX_FILL_TIME
     old_margins = jnp.stack(
         [
             machine.tilt_end - state.tilt,
-            MAX_PENETRATION - x,
+            MAX_PENETRATION - (x - state.dig_x),
             surface_margin(x, z),
             deadline - state.time,
         ]
@@ -306,7 +327,7 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     new_margins = jnp.stack(
         [
             machine.tilt_end - tilt,
-            MAX_PENETRATION - new_x,
+            MAX_PENETRATION - (new_x - state.dig_x),
             surface_margin(new_x, new_z),
             deadline - trial.time,
         ]
@@ -315,7 +336,10 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     drop = jnp.where(crossed, jnp.maximum(old_margins - new_margins, 1e-9), 1.0)
     part = jnp.where(crossed, jnp.clip(old_margins / drop, 0.0, 1.0), 1.0)
     reason = jnp.argmin(part, axis=0).astype(jnp.int32)
-    stops = crossed.any(axis=0)
+    # In the lane a cycle gives way to its other half where that one's heightfield begins.
+    gate = state.dig_x - STATE_DISPLACEMENT
+    arrives = filling & (state.dig_x > 0.0) & (new_x >= gate)
+    stops = crossed.any(axis=0) & ~arrives
 
     # After the stop the bucket tilts to its end and the brake holds; the later of the two ends it.
     left_tilt = (machine.tilt_end - state.tilt) / jnp.maximum(tilt - state.tilt, 1e-9)
@@ -324,7 +348,9 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     left = jnp.minimum(jnp.maximum(left_tilt, left_brake), give_up)
     ends = (state.phase == _STOPPED) & (left <= 1.0)
     fraction = jnp.where(filling, part.min(axis=0), jnp.where(ends, jnp.clip(left, 0.0, 1.0), 1.0))
-    fraction = jnp.where(state.phase == _ENDED, 0.0, fraction)
+    arrived = jnp.clip((gate - x) / jnp.where(arrives, new_x - x, 1.0), 0.0, 1.0)
+    fraction = jnp.where(arrives, arrived, fraction)
+    fraction = jnp.where(state.has_ended, 0.0, fraction)
 
     # What the step does not change is the same array before and after.
     def mix(old: Array, new: Array) -> Array:
@@ -337,7 +363,9 @@ def _step(state: State, machine: WheelLoader, soil: Soil, step: float) -> State:
     mixed = mixed.replace(tilt=jnp.minimum(mixed.tilt, machine.tilt_end))
     stop_x, stop_z = loader.bucket_tip(machine, mixed.position, mixed.boom, mixed.tilt)
     return mixed.replace(
-        phase=jnp.where(stops, _STOPPED, jnp.where(ends, _ENDED, state.phase)),
+        phase=jnp.where(
+            stops, _STOPPED, jnp.where(ends, _ENDED, jnp.where(arrives, _ARRIVED, state.phase))
+        ),
         stop_reason=jnp.where(stops, reason, state.stop_reason),
         stop_time=jnp.where(stops, mixed.time, state.stop_time),
         stop_x=jnp.where(stops, stop_x, state.stop_x),
@@ -373,26 +401,33 @@ def dig(
         soil: Soil parameters.
         settings: Time step, and whether reverse-mode derivatives must pass.
     """
-    one = jax.tree.map(lambda part: jnp.asarray(part)[..., None], (height, ground, action))
-    if settings.differentiable:
-        cycles = _dig_recorded(one[0], one[1], one[2], machine, soil, settings)
-    else:
-        cycles = _digger(machine, soil, settings)(one[0], one[1], one[2])
-    cycle: Cycle = jax.tree.map(lambda part: part[..., 0], cycles)
-    return cycle
+
+    def play(height: Array, ground: Array, action: Action) -> Cycle:
+        state = begin(height, ground, action, machine)
+        state = play_out(state, machine=machine, soil=soil, settings=settings)
+        return outcome(state, machine=machine, soil=soil)
+
+    return played_alone(play, settings, height, ground, action)
 
 
-def _dig_recorded(
-    height: Array,
-    ground: Array,
-    action: Action,
-    machine: WheelLoader,
-    soil: Soil,
-    settings: Settings,
-) -> Cycle:
-    """Cycles side by side, in as many steps as any cycle may take, for reverse mode."""
-    # Rematerialised in chunks: memory grows with the square root of the number of steps.
-    chunk = math.isqrt(settings.max_steps) + 1
+def play_out(
+    state: State, *, machine: WheelLoader, soil: Soil, settings: Settings, longer: float = 0.0
+) -> State:
+    """Steps until all cycles have ended.
+
+    Args:
+        state: Cycles side by side.
+        machine: Machine parameters.
+        soil: Soil parameters.
+        settings: Time step, and whether reverse-mode derivatives must pass.
+        longer: Time that a cycle may take beyond that of `Settings.max_steps` [s].
+    """
+    most = settings.max_steps + math.ceil(longer / settings.step)
+    if not settings.differentiable:
+        return advance(state, machine=machine, soil=soil, settings=settings, steps=most)
+    # As many steps as any cycle may take. Rematerialised in chunks: memory grows with the square
+    # root of the number of steps.
+    chunk = math.isqrt(most) + 1
 
     @jax.checkpoint
     def advance_chunk(state: State, _: None) -> tuple[State, None]:
@@ -405,23 +440,22 @@ def _dig_recorded(
         # When all have ended there is nothing left to do, nor to go back through.
         return lax.cond(state.has_ended.all(), lambda s: s, steps, state), None
 
-    state = begin(height, ground, action, machine)
-    state, _ = lax.scan(advance_chunk, state, None, length=chunk)
-    return outcome(state, machine=machine, soil=soil)
+    last: State = lax.scan(advance_chunk, state, None, length=chunk)[0]
+    return last
 
 
-def _digger(
-    machine: WheelLoader, soil: Soil, settings: Settings
-) -> Callable[[Array, Array, Action], Cycle]:
-    """Plays cycles side by side."""
+def played_alone(play: Callable[..., Cycle], settings: Settings, *arguments: Any) -> Cycle:
+    """One cycle of a function that plays them side by side.
 
-    def play(height: Array, ground: Array, action: Action) -> Cycle:
-        state = begin(height, ground, action, machine)
-        steps = settings.max_steps
-        state = advance(state, machine=machine, soil=soil, settings=settings, steps=steps)
-        return outcome(state, machine=machine, soil=soil)
-
-    return side_by_side(play)
+    Args:
+        play: As of `side_by_side`.
+        settings: Whether reverse-mode derivatives must pass.
+        arguments: What it is called with, for one cycle.
+    """
+    one = jax.tree.map(lambda part: jnp.asarray(part)[..., None], arguments)
+    cycles = play(*one) if settings.differentiable else side_by_side(play)(*one)
+    cycle: Cycle = jax.tree.map(lambda part: part[..., 0], cycles)
+    return cycle
 
 
 def side_by_side(play: Callable[..., Any]) -> Callable[..., Any]:

@@ -170,6 +170,8 @@ def reaction(
     fill: Float[Array, "lanes b"],
     bucket: Bucket,
     wanted: Bool[Array, ""],
+    taken: Float[Array, " b"] | float = 0.0,
+    backed: Float[Array, " b"] | float = 1.0,
 ) -> Reaction:
     """Resistance that the soil would put up against the bucket moving forward.
 
@@ -185,6 +187,9 @@ def reaction(
         fill: Volume of soil in each lane of the bucket [m^3].
         bucket: Pose of the bucket.
         wanted: False where no result is wanted.
+        taken: Of the fill, what was taken up on the approach, at most [m^3].
+        backed: 1; 0 in the approach lane, where no pile stands behind the soil that is met, so
+            that it gives way.
     """
     lanes = Lanes(machine)
     width = jnp.asarray(lanes.width, height.dtype)
@@ -200,23 +205,29 @@ def reaction(
     pressed = bucket.tilt + soil.steel_friction
     wedge = wedge_of(depth * jnp.cos(slope), rake, slope, soil.steel_friction, soil=soil)
     wedge, bare, depth = materialize_if((wedge, bare, depth), wanted)
-    cutting = total(width * bare * least_resistance(wedge, soil=soil))
-    edge = soil.edge_resistance * total(width * jnp.clip(depth / _EDGE_DEPTH, 0.0, 1.0))
+    cutting = backed * total(width * bare * least_resistance(wedge, soil=soil))
+    edge = backed * total(width * jnp.clip(depth / _EDGE_DEPTH, 0.0, 1.0))
 
-    content = total(fill) * soil.density
+    volume = total(fill)
+    content = volume * soil.density
     load = content * GRAVITY
+    thickness = volume / (machine.bucket_depth * machine.bucket_width)
+    # What was taken up in the lane is pushed only as far as the pile stands before it.
+    against = backed * jnp.clip(
+        total(width * depth) / machine.bucket_width / jnp.maximum(thickness, 1e-3), 0.0, 1.0
+    )
+    loose = (1.0 - against) * jnp.minimum(taken, volume) * soil.density * GRAVITY
     # As the bucket tilts back its mouth turns upward, and the content is pushed less.
-    push = soil.content_push * load * (1.0 - jnp.sin(bucket.tilt))
-    carried = soil.content_carry * load
+    push = soil.content_push * (load - loose) * (1.0 - jnp.sin(bucket.tilt))
+    carried = soil.content_carry * (load - loose)
     bearing, bearing_moment = _bearing(machine, soil, lanes, met, lanes.of(ground), bucket)
 
     sine, cosine = jnp.sin(bucket.tilt), jnp.cos(bucket.tilt)
     rubbing = math.tan(soil.steel_friction)
     middle = machine.bucket_depth / 2
-    thickness = content / (soil.density * machine.bucket_depth * machine.bucket_width)
     return Reaction(
         horizontal=cutting * jnp.sin(pressed)
-        + edge
+        + soil.edge_resistance * edge
         + push
         + rubbing * load
         + (sine / cosine + rubbing) * bearing,

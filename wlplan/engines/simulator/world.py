@@ -8,13 +8,21 @@ from typing import no_type_check
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax import lax
 from jaxtyping import Array, Float
 
 from wlplan.constants import J_PER_KJ, KG_PER_TONNE
-from wlplan.engines.simulator.cycle import Cycle, Settings, dig
+from wlplan.engines.simulator.cycle import Cycle, Settings
+from wlplan.engines.simulator.lane import behind, dig_through_lane, lane_of
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, Soil
-from wlplan.terrain.automaton import DEFAULT_SCHEDULE, Schedule, settle_dug, window_of
+from wlplan.terrain.automaton import (
+    DEFAULT_SCHEDULE,
+    Schedule,
+    paste,
+    settle_dug,
+    window_of,
+)
 from wlplan.terrain.heightmap import (
     STATE_CELLS,
     STATE_DISPLACEMENT,
@@ -44,7 +52,10 @@ class Simulator(struct.PyTreeNode):
         return after, performance
 
     def foresee(self, pile: Pile, pose: Pose, action: Action) -> Performance:
-        """The performance alone, the same as by calling it."""
+        """The performance alone, the same as by calling it.
+
+        But for soil that is not there to be dug because it has slid off in the lane before.
+        """
         performance: Performance = _foresee(self, pile, pose, action)
         return performance
 
@@ -103,26 +114,52 @@ class Simulator(struct.PyTreeNode):
         Returns:
             The pile after, relaxed, the performance, and how the automaton ended.
         """
-        window, start = window_of(pile, pose)
-        dug, missing = _written(window, pose, height, cycle)
-        settled = settle_dug(
-            pile,
-            dug,
-            start,
-            repose_angle=self.soil.repose_angle,
-            schedule=self.schedule,
+        after, report = self._settled(pile, pose, cycle.height - height, cycle.lane_change)
+        return after, _performance(cycle, report.missing, self.soil), report
+
+    def _settled(
+        self,
+        pile: Pile,
+        pose: Pose,
+        change: Float[Array, "52 52"],
+        lane_change: Float[Array, "52 52"] | None,
+    ) -> tuple[Pile, SolveReport]:
+        """Writes the changes of a loading to its pile and lets it slide, first in the lane."""
+
+        def settle(
+            surface: Array, pose: Pose, change: Array
+        ) -> tuple[Array, tuple[Array, Array, Array, Array]]:
+            before = pile.replace(height=surface)
+            window, start = window_of(before, pose)
+            dug, missing = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+            after = settle_dug(
+                before, dug, start, repose_angle=self.soil.repose_angle, schedule=self.schedule
+            )
+            ended = after.rounds, after.at_rest, after.steepest_slope, missing
+            return after.pile.height, ended
+
+        if lane_change is None:
+            height, ended = settle(pile.height, pose, change)
+            return pile.replace(height=height), SolveReport(*ended)
+
+        # A loop of two, so that the automaton is compiled once.
+        def turn(
+            surface: Array, part: tuple[Pose, Array, Array]
+        ) -> tuple[Array, tuple[Array, ...]]:
+            where, change, wanted = part
+            nothing = jnp.zeros_like(surface[0, 0])
+            rest = jnp.zeros((), jnp.int32), jnp.ones((), bool), nothing, nothing
+            return lax.cond(wanted, lambda: settle(surface, where, change), lambda: (surface, rest))
+
+        is_met = (lane_change != 0.0).any()
+        poses = jax.tree.map(lambda *v: jnp.stack(v), behind(pose), pose)
+        changes = jnp.stack([lane_change, change])
+        wanted = jnp.stack([is_met, jnp.ones((), bool)])
+        height, (rounds, at_rest, slope, missing) = lax.scan(
+            turn, pile.height, (poses, changes, wanted)
         )
-        performance = _performance(cycle, missing, self.soil)
-        report = SolveReport(settled.rounds, settled.at_rest, settled.steepest_slope, missing)
-        return settled.pile, performance, report
-
-
-def _written(
-    window: Pile, pose: Pose, height: Float[Array, "52 52"], cycle: Cycle
-) -> tuple[Float[Array, "n m"], Float[Array, ""]]:
-    """The part of the pile around a loading before it slides, and what is missing of it [m^3]."""
-    change = cycle.height - height
-    return add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+        report = SolveReport(rounds.sum(), at_rest.all(), slope[1], missing.sum())
+        return pile.replace(height=height), report
 
 
 def _performance(cycle: Cycle, missing: Float[Array, ""], soil: Soil) -> Performance:
@@ -140,9 +177,10 @@ def _dig(
     simulator: Simulator, pile: Pile, pose: Pose, action: Action
 ) -> tuple[Float[Array, "52 52"], Cycle]:
     height, ground = simulator.view(pile, pose)
-    cycle = dig(
+    cycle = dig_through_lane(
         height,
         ground,
+        lane_of(pile, pose, simulator.machine),
         action,
         machine=simulator.machine,
         soil=simulator.soil,
@@ -154,9 +192,24 @@ def _dig(
 @jax.jit
 def _foresee(simulator: Simulator, pile: Pile, pose: Pose, action: Action) -> Performance:
     height, cycle = _dig(simulator, pile, pose, action)
-    window, _ = window_of(pile, pose)
-    _, missing = _written(window, pose, height, cycle)
-    return _performance(cycle, missing, simulator.soil)
+    change, lane_change = cycle.height - height, cycle.lane_change
+    assert lane_change is not None
+    surface, missing = lax.cond(
+        (lane_change != 0.0).any(),
+        lambda: _written(pile, behind(pose), lane_change),
+        lambda: (pile.height, jnp.zeros_like(change[0, 0])),
+    )
+    _, more = _written(pile.replace(height=surface), pose, change)
+    return _performance(cycle, missing + more, simulator.soil)
+
+
+def _written(
+    pile: Pile, pose: Pose, change: Float[Array, "52 52"]
+) -> tuple[Float[Array, "nx ny"], Float[Array, ""]]:
+    """A pile's surface after a change before it slides [m], and what is missing of it [m^3]."""
+    window, start = window_of(pile, pose)
+    dug, missing = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+    return paste(pile.height, dug, jnp.stack(start)), missing
 
 
 @jax.jit

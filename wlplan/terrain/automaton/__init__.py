@@ -29,7 +29,7 @@ from wlplan.terrain.automaton.flow import FLOW_FRACTION, converged, sweep, sweep
 from wlplan.terrain.automaton.relaxation import relax, settle, settle_dug
 from wlplan.terrain.automaton.rounds import DEFAULT_SCHEDULE, Schedule
 from wlplan.terrain.automaton.slopes import movable, steepest_slope
-from wlplan.terrain.automaton.windows import window_of
+from wlplan.terrain.automaton.windows import paste, window_of
 
 __all__ = [
     "DEFAULT_SCHEDULE",
@@ -37,6 +37,7 @@ __all__ = [
     "Schedule",
     "converged",
     "movable",
+    "paste",
     "relax",
     "settle",
     "settle_dug",
