@@ -72,9 +72,8 @@ def lane_of(
         return jnp.zeros((STATE_CELLS, STATE_CELLS), pile.height.dtype), jnp.asarray(False)
 
     def soil(rows: np.ndarray, columns: slice) -> Float[Array, "n m"]:
-        along = jnp.asarray(_ALONG[rows][:, None], pile.height.dtype)
-        left = jnp.asarray(_LEFT[columns][None], pile.height.dtype)
-        x, y = to_world(pose, along, left)
+        axes = (jnp.asarray(axis, pile.height.dtype) for axis in (_ALONG[rows], _LEFT[columns]))
+        x, y = to_world(pose, *jnp.meshgrid(*axes, indexing="ij"))
         height = sample(pile.height, pile, x, y)
         if pile.ground is not None:
             height = height - sample(pile.ground, pile, x, y)
