@@ -37,7 +37,8 @@ def drawn() -> np.ndarray:
     """Logarithms of the factors of many seeds [seeds, 3]."""
     world = wlplan.scattered(trench)
     factors = jax.jit(jax.vmap(lambda seed: world.replace(seed=seed).factors(POSE, ACTION)))
-    return np.log(np.asarray(factors(jnp.arange(SEEDS))))
+    found: np.ndarray = np.log(np.asarray(factors(jnp.arange(SEEDS))))
+    return found
 
 
 def test_the_factors_spread_and_go_together_as_is_said(drawn: np.ndarray) -> None:

@@ -110,9 +110,9 @@ def loadings(seed_piles: list[tuple[Pile, ToeContour]]) -> Loadings:
         add(pile, contour, POSES, np.zeros((GRID, GRID)), lambda r: r.normal(0.0, 0.2))
     for pile, contour in seed_piles:
         add(pile, contour, 2, rough, lambda r: r.normal(0.0, 0.2))
-    # Away from the pile, over the edge of the grid, and flat ground.
+    # Past the pile, over the edge of the grid, and flat ground.
     pile, contour = seed_piles[0]
-    for x, y, heading in ((-9.5, 0.0, math.pi), (-11.0, -11.0, -2.4), (40.0, 3.0, 0.0)):
+    for x, y, heading in ((-10.5, 0.0, math.pi / 2), (-11.0, -11.0, -2.4), (40.0, 3.0, 0.0)):
         floors.append(np.zeros((GRID, GRID)))
         heights.append(np.asarray(pile.height))
         origins.append(np.asarray(pile.origin))
@@ -773,8 +773,8 @@ SMOOTH = np.array(
         [-6.8, -0.7, 0.15, 0.25, 1.5, 0.4, 2.8],
     ]
 )
-# Off the pile, driving away from it.
-NOWHERE = np.array([-9.0, 0.0, math.pi, 0.35, 2.2, 0.3, 2.0])
+# Off the pile, driving past it.
+NOWHERE = np.array([-10.5, 0.0, math.pi / 2, 0.35, 2.2, 0.3, 2.0])
 # Mass, time, work of the first and mass of the second; mass of nothing.
 OF_POINT, OF_OUTPUT = np.array([0, 0, 0, 1, 2]), np.array([0, 1, 2, 0, 0])
 

@@ -39,8 +39,8 @@ class Scattered(struct.PyTreeNode):
 
     def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         """The pile and the performance after one loading."""
-        after, performance, *_ = self._scattered(self.world, pile, pose, action)
-        return after, performance
+        after, performance = self.world(pile, pose, action)
+        return self._scattered(pile, pose, action, after, performance)
 
     @property
     def differentiable(self) -> bool | None:
@@ -52,10 +52,9 @@ class Scattered(struct.PyTreeNode):
         return self.replace(world=with_derivatives(self.world))
 
     def _scattered(
-        self, play: Any, pile: Pile, pose: Pose, action: Action
-    ) -> tuple[Pile, Performance, SolveReport] | tuple[Pile, Performance]:
-        """What a function `play` of pile, pose and action returns, with scatter."""
-        after, performance, *report = play(pile, pose, action)
+        self, pile: Pile, pose: Pose, action: Action, after: Pile, performance: Performance
+    ) -> tuple[Pile, Performance]:
+        """What a loading leaves and yields with scatter; without it, `after` and `performance`."""
         factor = self.factors(pose, action).astype(pile.height.dtype)
         # More or less of what was moved is moved; what lies on the floor cannot be less.
         change = after.height - pile.height
@@ -66,7 +65,7 @@ class Scattered(struct.PyTreeNode):
         lost, more = -change.sum(), (after.height - height).sum()
         mass = performance.mass * (1.0 + more / jnp.where(lost > 0.0, lost, jnp.inf))
         scattered = Performance(mass, performance.time * factor[1], performance.work * factor[2])
-        return after.replace(height=height), scattered, *report
+        return after.replace(height=height), scattered
 
     def factors(self, pose: Pose, action: Action) -> Float[Array, "3"]:
         """Factors on mass, time and work: of a seed and a loading always the same.
@@ -94,7 +93,9 @@ class ScatteredSolver(Scattered):
         self, pile: Pile, pose: Pose, action: Action
     ) -> tuple[Pile, Performance, SolveReport]:
         """One loading as by calling it, and how the solve without scatter ended."""
-        return self._scattered(self.world.solve, pile, pose, action)
+        world: Any = self.world
+        after, performance, report = world.solve(pile, pose, action)
+        return *self._scattered(pile, pose, action, after, performance), report
 
 
 def scattered(

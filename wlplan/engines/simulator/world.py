@@ -136,7 +136,8 @@ class Simulator(struct.PyTreeNode):
                 before, dug, start, repose_angle=self.soil.repose_angle, schedule=self.schedule
             )
             ended = after.rounds, after.at_rest, after.steepest_slope, missing
-            return after.pile.height, ended
+            height: Array = after.pile.height
+            return height, ended
 
         if lane_change is None:
             height, ended = settle(pile.height, pose, change)
@@ -149,7 +150,10 @@ class Simulator(struct.PyTreeNode):
             where, change, wanted = part
             nothing = jnp.zeros_like(surface[0, 0])
             rest = jnp.zeros((), jnp.int32), jnp.ones((), bool), nothing, nothing
-            return lax.cond(wanted, lambda: settle(surface, where, change), lambda: (surface, rest))
+            after: tuple[Array, tuple[Array, ...]] = lax.cond(
+                wanted, lambda: settle(surface, where, change), lambda: (surface, rest)
+            )
+            return after
 
         is_met = (lane_change != 0.0).any()
         poses = jax.tree.map(lambda *v: jnp.stack(v), behind(pose), pose)
