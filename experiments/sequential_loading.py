@@ -24,7 +24,7 @@ from experiments._common.results import dataset_summary, main
 from experiments.error_distribution import STALL
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
-from wlplan.dataset.protocol import Episode, choose_pose
+from wlplan.dataset.episode import Episode, choose_pose
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic

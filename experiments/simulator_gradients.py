@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 import wlplan
 from experiments._common.results import main
 from wlplan.constants import ACTION_HIGH, ACTION_LOW, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
-from wlplan.dataset.protocol import Episode, choose_pose
+from wlplan.dataset.episode import Episode, choose_pose
 from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from wlplan.constants import CELL_SIZE, J_PER_KJ
-from wlplan.dataset.protocol import Episode
+from wlplan.dataset.episode import Episode
 from wlplan.engines.simulator import Simulator
 from wlplan.engines.simulator.cycle import State, advance, begin, outcome
 from wlplan.terrain.characteristics import as_vector, characteristics

@@ -1,4 +1,4 @@
-"""Protocols: which piles are dug where, with which actions, and what is recorded.
+"""Episodes: which piles are dug where, with which actions, and what is recorded.
 
 An `Episode` is one pile with all that is random about digging it. In a data set the variable
 `rollout` holds its number.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +18,7 @@ from jaxtyping import Array, Float
 
 from wlplan.actions import latin_hypercube
 from wlplan.constants import ACTION_HIGH, ACTION_LOW, CELL_SIZE
+from wlplan.dataset.protocols import PROTOCOLS
 from wlplan.dataset.variables import LOADS, VARIABLES, h36_after
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
@@ -27,22 +27,10 @@ from wlplan.terrain.seed_piles import SEED_PILES, seed_pile
 from wlplan.terrain.toe import toe_contour
 from wlplan.types import Pile
 
-# Largest deviation of the heading from the normal of the toe [rad]. Paper, section 6.2.
-_HEADING_SPREAD = math.radians(10.0)
-# What the random streams are for; part of their keys.
-_ROLLOUT_STREAM, _ACTION_STREAM, _CORRIDOR_STREAM, _SLOW_STREAM = 0, 1, 2, 3
-# A corridor: part of the loadings that stay near the one before, and how near they stay, the
-# standard deviation of either coordinate [m].
-_STAY, _NEAR = 0.85, 0.5
-# Slow loadings: from which filling time [s] (a tenth of all), part of the loadings after one whose
-# action is similar, and how similar, the standard deviation of each parameter over its range.
-_SLOW_FILLING, _REPEAT, _SIMILAR = 4.0, 0.8, 0.1
-
-PROTOCOLS = ("paper", "corridor", "slow")
-"""How an episode continues. "paper": anywhere along the toe with any action, as in section 6.2.
-"corridor": mostly near where it dug before, as plans do: so corridors come about, and what stands
-between them. "slow": anywhere, mostly with an action like that of the last slow filling: so there
-are far more loadings that stall, or nearly do, than the paper's few in a hundred."""
+# What the random streams are for; part of their keys. `PROTOCOLS` has those of the protocols.
+_ROLLOUT_STREAM, _ACTION_STREAM = 0, 1
+# A filling from this time on is slow [s]: a tenth of all.
+_SLOW_FILLING = 4.0
 
 
 class Episode:
@@ -74,23 +62,8 @@ class Episode:
         random = np.random.default_rng(key)
         self.noise_seed = int(random.integers(2**31))
         self.place, turn = random.random((2, length))  # [0, 1) along the accessible toe
-        self.turn = _HEADING_SPREAD * (2.0 * turn - 1.0)
-        # Of every loading, how far from the one before it is looked for [m]; NaN: anywhere.
-        self.shift = np.full((length, 2), np.nan)
-        if protocol == "corridor":
-            key = np.random.SeedSequence(seed, spawn_key=(_CORRIDOR_STREAM, number))
-            random = np.random.default_rng(key)
-            stays = random.random(length) < _STAY
-            stays[0] = False
-            self.shift = np.where(stays[:, None], random.normal(0.0, _NEAR, (length, 2)), np.nan)
-        # Of every loading, what its action differs by from the last slow one's; NaN: in everything.
-        self.variation = np.full((length, 4), np.nan)
-        if protocol == "slow":
-            key = np.random.SeedSequence(seed, spawn_key=(_SLOW_STREAM, number))
-            random = np.random.default_rng(key)
-            repeats = random.random(length) < _REPEAT
-            drawn = random.normal(0.0, _SIMILAR, (length, 4))
-            self.variation = np.where(repeats[:, None], drawn, np.nan)
+        self.turn = PROTOCOLS[protocol].turn * (2.0 * turn - 1.0)
+        self.draws = PROTOCOLS[protocol].draw(seed, number, length)
         key = np.random.SeedSequence(seed, spawn_key=(_ACTION_STREAM, repeat))
         unit = latin_hypercube(len(SEED_PILES) * length, 4, np.random.default_rng(key))
         low, high = np.array(ACTION_LOW), np.array(ACTION_HIGH)
@@ -121,13 +94,14 @@ class Episode:
     def next_loading(self) -> tuple[np.ndarray, np.ndarray]:
         """Pose x, y [m], heading [rad], shape [3], and action, shape [4], of the next loading."""
         pile = Pile(self.height, CELL_SIZE, self.origin)
-        shift = self.shift[self.load]
+        shift, variation, past = (draw[self.load] for draw in self.draws)
         near = None if np.isnan(shift).any() else self.pose[:2] + shift
         pose = choose_pose(pile, self.place[self.load], self.turn[self.load], near)
         self.valid = pose is not None
         # A pile that is used up is dug where it was dug last; `valid` tells.
-        self.pose = self.pose if pose is None else pose
-        variation = self.variation[self.load]
+        if pose is not None:
+            ahead = past * np.array([np.cos(pose[2]), np.sin(pose[2]), 0.0])
+            self.pose = pose + ahead.astype(np.float32)
         if not np.isnan(variation).any():
             slow = [load["action"] for load in self.loadings if load["fill_time"] >= _SLOW_FILLING]
             if slow:
