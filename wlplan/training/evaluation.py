@@ -158,6 +158,24 @@ def _interval(error: Float[np.ndarray, " n"], deviation: Float[np.ndarray, " n"]
     )
 
 
+def shortfall(ensemble: Ensemble, dataset: Dataset) -> Float[Array, "3"]:
+    """What an ensemble has to add to each prediction, in deviations, for its sums to come out.
+
+    That of the mass is zero: of a bucket that comes out empty nothing can be taken.
+
+    Args:
+        ensemble: Ensemble without a bias, whose own factors are one.
+        dataset: Cycles that its members were not trained on.
+    """
+    predicted, deviation = predict_with_deviation(ensemble, dataset)
+    assert deviation is not None
+    bias = {}
+    for name in QUANTITIES:
+        short = getattr(dataset, name).astype(np.float64) - np.asarray(getattr(predicted, name))
+        bias[name] = short.sum() / np.asarray(getattr(deviation, name), np.float64).sum()
+    return jnp.asarray(np.array([0.0, bias["time"], bias["work"]], np.float32))
+
+
 def widening(ensemble: Ensemble, dataset: Dataset) -> Float[Array, "3"]:
     """Factors by which an ensemble has to widen its deviations of mass, time and work.
 
