@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments._common.models import load_or_train, smoke_settings
+from experiments._common.places import say
 from experiments._common.results import dataset_summary, main
 from experiments.error_distribution import STALL
 from wlplan.constants import CELL_SIZE
@@ -82,7 +82,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     volumes = np.array([sequence.volumes for sequence in sequences])
     rows = {}
     for name, world in worlds.items():
-        print(f"{loads} loads on {piles} piles in the {name} world", file=sys.stderr, flush=True)
+        say(f"{loads} loads on {piles} piles in the {name} world")
         own = [predicted(world, sequence, own_pile=True) for sequence in sequences]
         given = [predicted(world, sequence, own_pile=False) for sequence in sequences]
         rows[name] = {
