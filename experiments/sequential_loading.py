@@ -68,7 +68,8 @@ class Sequence:
 
 
 @jax.jit
-def _load(world: World, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+def load(world: World, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+    """One loading in a world, compiled once for each."""
     return world(pile, pose, action)
 
 
@@ -154,7 +155,7 @@ def simulated(number: int, loads: int) -> Sequence:
         pose = choose_pose(pile, place, turn)
         if pose is None:
             raise RuntimeError(f"pile {number} is used up after {len(poses)} loads")
-        pile, performance = _load(simulator, pile, _pose(pose), action_from(jnp.asarray(action)))
+        pile, performance = load(simulator, pile, pose_of(pose), action_from(jnp.asarray(action)))
         heights.append(np.asarray(pile.height))
         poses.append(pose)
         outcomes.append([float(getattr(performance, name)) for name in OUTCOMES])
@@ -191,7 +192,7 @@ def predicted(
         if not own_pile:
             pile = pile.replace(height=jnp.asarray(sequence.heights[n]))
         before = np.asarray(pile.height, np.float64)
-        pile, performance = _load(world, pile, _pose(pose), action_from(jnp.asarray(action)))
+        pile, performance = load(world, pile, pose_of(pose), action_from(jnp.asarray(action)))
         after = np.asarray(pile.height, np.float64)
         volume += (after - before).sum() * CELL_SIZE**2
         outcomes.append([float(getattr(performance, name)) for name in OUTCOMES])
@@ -200,7 +201,8 @@ def predicted(
     return np.array(outcomes), np.array(volumes), np.array(misplaced)
 
 
-def _pose(values: np.ndarray) -> Pose:
+def pose_of(values: np.ndarray) -> Pose:
+    """The pose of a row of a sequence."""
     return Pose(*jnp.asarray(values, jnp.float32))
 
 
