@@ -62,7 +62,7 @@ def _summary(foreseen: Performance, played: Performance, name: str) -> dict[str,
     """One quantity over the places, and how well it is foreseen."""
     guessed, true = (np.asarray(getattr(part, name), float) for part in (foreseen, played))
     error = np.abs(guessed / true - 1.0)
-    ranks = [np.argsort(np.argsort(values)) for values in (guessed, true)]
+    ranks = np.stack([np.argsort(np.argsort(values)) for values in (guessed, true)]).astype(float)
     numbers = {
         "least": guessed.min(),
         "median": np.median(guessed),
@@ -70,7 +70,7 @@ def _summary(foreseen: Performance, played: Performance, name: str) -> dict[str,
         "median_played": np.median(true),
         "mean_relative_error": error.mean(),
         "median_relative_error": np.median(error),
-        "rank_correlation": np.corrcoef(*ranks)[0, 1],
+        "rank_correlation": np.corrcoef(ranks)[0, 1],
     }
     return {key: float(f"{value:.4g}") for key, value in numbers.items()}
 
@@ -78,10 +78,11 @@ def _summary(foreseen: Performance, played: Performance, name: str) -> dict[str,
 def draw(folder: Path) -> None:
     """Maps of the three quantities with their histograms."""
     result = json.loads((folder / "diggability_map.json").read_text())
-    pose, performance = (
-        kind(**{name: jnp.asarray(values, jnp.float32) for name, values in result[part].items()})
-        for kind, part in ((Pose, "pose"), (Performance, "foreseen"))
-    )
+    columns = {
+        part: {name: jnp.asarray(values, jnp.float32) for name, values in result[part].items()}
+        for part in ("pose", "foreseen")
+    }
+    pose, performance = Pose(**columns["pose"]), Performance(**columns["foreseen"])
     pile = wlplan.read_pile(bundled_pile_path())
     figure = diggability_figure(pile, DiggabilityMap(pose, performance))
     write_bytes_atomic(folder / "diggability_map.png", png_bytes(figure, dpi=100))

@@ -144,7 +144,7 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
     except InputError as error:
         say(f"error: {error}")
         raise SystemExit(2) from error
-    say(f"{name}: done, see {folder / name}.json and .png")
+    say(f"{name}: done, see {folder}")
 
 
 def _run(

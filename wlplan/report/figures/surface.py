@@ -68,6 +68,10 @@ class View:
         return c * x + s * y, s * x - c * y
 
 
+FROM_BEHIND = View(azimuth=math.radians(50.0), elevation=math.radians(30.0))
+"""For local heightmaps: the loader digs to the right and back."""
+
+
 def draw_surface(
     panel: Axes,
     height: Float[np.ndarray, "nx ny"],
@@ -125,7 +129,7 @@ def draw_surface(
 def _middles(field: Float[np.ndarray, "nx ny"]) -> Float[np.ndarray, "mx my"]:
     """Means of the corners of each patch."""
     parts = (field[:-1, :-1], field[1:, :-1], field[1:, 1:], field[:-1, 1:])
-    middles: np.ndarray = sum(np.asarray(part, float) for part in parts) / 4.0
+    middles: np.ndarray = np.mean(parts, axis=0, dtype=float)
     return middles
 
 
