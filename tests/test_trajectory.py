@@ -94,7 +94,8 @@ def test_a_batch_equals_its_members(both: tuple[Cycle, Trajectory]) -> None:
 
 @pytest.fixture(scope="module")
 def sections() -> tuple[Trajectory, Section]:
-    return played(trace_section)
+    both: tuple[Trajectory, Section] = played(trace_section)
+    return both
 
 
 def test_the_section_is_of_the_same_motion_and_ends_as_the_cycle_leaves_the_soil(

@@ -65,7 +65,7 @@ class View:
     ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
         c, s = math.cos(self.azimuth), math.sin(self.azimuth)
         x, y = points[..., 0], points[..., 1]
-        return c * x + s * y, s * x - c * y
+        return np.asarray(c * x + s * y), np.asarray(s * x - c * y)
 
 
 FROM_BEHIND = View(azimuth=math.radians(50.0), elevation=math.radians(30.0))
