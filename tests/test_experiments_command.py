@@ -240,3 +240,18 @@ def test_the_paper_is_the_full_preset_of_what_shows_it(
         (["a"], "full", places.OUT / "full"),
         (["a", "b"], "full", places.OUT / "full"),
     ]
+
+
+def test_a_run_of_all_that_is_stopped_says_how_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(name: str, *_: object) -> bool:
+        if name == "b":
+            raise KeyboardInterrupt
+        return True
+
+    monkeypatch.setattr(everything, "_succeeds", stopped)
+    monkeypatch.setattr(everything, "experiments", lambda: [of("a"), of("b")])
+    assert everything.main(["--out", str(tmp_path)]) == 130
+    assert "goes on where it was" in capsys.readouterr().err
+    assert list(json.loads((tmp_path / "finished.json").read_text())) == ["a"]

@@ -39,7 +39,11 @@ def main(arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     preset = "full" if options.preset == PAPER else options.preset
     chosen = [one for one in experiments() if options.preset != PAPER or one.paper]
-    return run_all(chosen, preset, options.out or OUT / preset, anew=options.anew)
+    try:
+        return run_all(chosen, preset, options.out or OUT / preset, anew=options.anew)
+    except KeyboardInterrupt:
+        say("\nstopped; the same command goes on where it was")
+        return 130
 
 
 def run_all(chosen: Sequence[Experiment], preset: str, folder: Path, *, anew: bool = False) -> int:
