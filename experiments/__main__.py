@@ -23,10 +23,11 @@ def main(arguments: list[str]) -> int:
     found = catalogue.experiments()
     if options.name is None:
         print(catalogue.table(found))
+        print(f"\nCollects data, and has options of its own: {', '.join(catalogue.recipes())}")
         return 0
     if options.name == "all":
         return everything.main(options.words)
-    names = [one.name for one in found]
+    names = [*(one.name for one in found), *catalogue.recipes()]
     if options.name not in names:
         near = difflib.get_close_matches(options.name, [*names, "all"], n=1)
         hint = f"did you mean {near[0]}?" if near else "`python -m experiments` lists them."

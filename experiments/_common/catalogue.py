@@ -46,15 +46,30 @@ class Experiment:
 
 def experiments() -> list[Experiment]:
     """All of them, by name."""
-    found = (_read(path) for path in sorted(_FOLDER.glob("[!_]*.py")))
+    found = (_read(path) for path in _files())
     return [one for one in found if one is not None]
+
+
+def recipes() -> list[str]:
+    """Names of files that collect data for the others: they have a command line and no result."""
+    read = {path.stem: _functions(ast.parse(path.read_text("utf-8"))) for path in _files()}
+    return [
+        name for name, functions in read.items() if "main" in functions and "run" not in functions
+    ]
+
+
+def _files() -> list[Path]:
+    return sorted(_FOLDER.glob("[!_]*.py"))
+
+
+def _functions(module: ast.Module) -> set[str]:
+    return {node.name for node in module.body if isinstance(node, ast.FunctionDef)}
 
 
 def _read(path: Path) -> Experiment | None:
     """The experiment in a file; None if it is none."""
     module = ast.parse(path.read_text(encoding="utf-8"))
-    functions = {node.name for node in module.body if isinstance(node, ast.FunctionDef)}
-    if not {"run", "draw"} <= functions:
+    if not {"run", "draw"} <= _functions(module):
         return None
     words = ast.get_docstring(module) or ""
     shows = _SHOWS.search(" ".join(words.split()))
