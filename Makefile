@@ -5,6 +5,8 @@
 # make test-newest  the same with the newest there are, on the newest Python at hand
 # make lint      style, types, imports
 # make docs      the documentation as a site, in out/docs/html; needs no network once it is installed
+# make experiments  every table and figure in a short run that shows that it runs, in out/experiments/smoke;
+#                PRESET=paper: those of the paper as committed, PRESET=full: all, which takes days
 # make weights   collect cycles into out/, train and evaluate every model that ships: half an hour
 #
 # Needs Python 3.11 or newer and make; everything else goes into .venv.
@@ -12,6 +14,7 @@
 
 PYTHON ?= python3
 LOADS ?= 10
+PRESET ?= smoke
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -20,10 +23,10 @@ PINS := pyproject.toml constraints.txt
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-lowest test-newest lint docs weights clean
+.PHONY: help demo test test-slow test-lowest test-newest lint docs experiments weights clean
 
 help:
-	@sed -n 's/^# \(make .*\)/\1/p' Makefile
+	@sed -n 's/^# \(make .*\|      .*\)/\1/p' Makefile
 
 $(VENV)/.created:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -90,6 +93,10 @@ lint: $(VENV)/.tools
 docs: $(VENV)/.tools
 	$(BIN)/python -m sphinx -b html -aE -W --keep-going -q -c docs . out/docs/html
 	@echo "open out/docs/html/index.html"
+
+# It goes on where it was cut short.
+experiments: $(VENV)/.package
+	$(BIN)/python -m experiments all --preset $(PRESET)
 
 weights: $(VENV)/.package
 	$(BIN)/wlplan train all --data out/cycles.zarr --out wlplan/pretrained

@@ -1,14 +1,13 @@
 """Gradients of the performance predictors: along a line of actions, and against the simulator's.
 
-The line is that of the paper's appendix C. The other comparison tells whether a gradient planner
-goes the right way: on random cycles of the data set's protocol, the angle between the gradient of a
-model in pose and action and central differences of the simulator.
+Paper, figure 19, is the line. The other comparison tells whether a gradient planner goes the right
+way: on random cycles of the data set's protocol, the angle between the gradient of a model in pose
+and action and central differences of the simulator.
 """
 
 from __future__ import annotations
 
 import json
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from experiments._common.models import (
     load_pretrained,
     smoke_settings,
 )
+from experiments._common.places import say
 from experiments._common.results import dataset_summary, main
 from experiments.simulator_gradients import (
     LINE,
@@ -155,7 +155,7 @@ def _differences(
         ahead, behind = np.moveaxis(values.reshape(3, len(widths), 2, 7), 2, 0)
         tables.append((ahead - behind) / (2.0 * widths[:, None]))
         if n % 20 == 0:
-            print(f"{n} of {len(cases[0])} cycles", file=sys.stderr, flush=True)
+            say(f"{n} of {len(cases[0])} cycles")
     by_step = np.moveaxis(np.array(tables), 2, 0)
     return {
         name: _in_its_frame(table, cases[2]) for name, table in zip(STEPS, by_step, strict=True)

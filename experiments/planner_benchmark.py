@@ -35,8 +35,10 @@ from experiments._common.comparison import (
     steps,
 )
 from experiments._common.instances import EACH, JOBS, PILES, SITES, SMOKE_JOB, Instance
-from experiments._common.results import PRESETS, RESULTS, write_result
+from experiments._common.places import RESULTS, add_places, folder_of, say
+from experiments._common.results import redraw, write_result
 from wlplan.cli.progress import Stopwatch
+from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic, write_text_atomic
 from wlplan.planning.amounts import Made, typical_load
 from wlplan.planning.job import make_job, with_toe
@@ -324,7 +326,7 @@ def work(
         row = play_run(run, planner, of_greedy, receiver)
         write_text_atomic(folder / f"{run.name}.json", json.dumps(row) + "\n")
         said = {name: value for name, value in row.items() if name != "plan"}
-        print(f"{number + 1}/{len(todo)} {json.dumps(said)}", flush=True)
+        say(f"{number + 1}/{len(todo)} {json.dumps(said)}")
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -405,9 +407,7 @@ def draw(folder: Path) -> None:
 def main() -> None:
     """Command line: plan and play, join what was played, or draw."""
     parser = argparse.ArgumentParser(prog="python -m experiments.planner_benchmark")
-    parser.add_argument("--preset", choices=PRESETS, default="full")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of results")
-    parser.add_argument("--draw", action="store_true", help="only draw what is there")
+    add_places(parser)
     parser.add_argument(
         "--rows", type=Path, help=f"folder of the runs (default {ROWS}, for smoke a new one)"
     )
@@ -424,33 +424,49 @@ def main() -> None:
     )
     parser.add_argument("--planner", action="append", default=[], metavar="MODULE:NAME")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    rows_in = options.rows or (options.out / ROWS.name if options.preset == "smoke" else ROWS)
-    if not options.draw:
-        planners = PLANNERS | {name: _always(load_object(name)) for name in options.planner}
-        chosen = tuple(SMOKE if options.preset == "smoke" else planners)
-        if not options.join:
-            until = time.monotonic() + 60.0 * options.minutes
-            part, parts = (int(number) for number in options.shard.split("/"))
-            everything = runs(options.preset, chosen)
-            todo = [
-                run
-                for pattern in options.only or ["*"]
-                for run in everything
-                if fnmatch.fnmatchcase(run.name, pattern)
-            ]
-            shown = SMOKE if options.preset == "smoke" else planners
-            # All of an instance go to one machine, which then has what they are compared with.
-            places = list(dict.fromkeys((run.instance, run.seed) for run in todo))
-            mine = set(places[part - 1 :: parts])
-            work([r for r in todo if (r.instance, r.seed) in mine], rows_in, shown, until)
-        rows = [json.loads(path.read_text()) for path in sorted(rows_in.glob("*.json"))]
-        best = options.out / BEST
-        known = json.loads(best.read_text()) if best.exists() else []
-        lines = ",\n".join(json.dumps(one) for one in best_plans(rows, known))
-        write_text_atomic(best, f"[{lines}]\n")
-        write_result("planner_benchmark", options.preset, run(options.preset, rows), options.out)
-    draw(options.out)
+    try:
+        folder = folder_of(options)
+        if options.draw:
+            redraw("planner_benchmark", draw, folder)
+        else:
+            _make(options, folder)
+            draw(folder)
+    except InputError as error:
+        say(f"error: {error}")
+        raise SystemExit(2) from error
+
+
+def _make(options: argparse.Namespace, folder: Path) -> None:
+    """Makes the runs that are asked for, and joins all that are there."""
+    rows_in = options.rows or (folder / ROWS.name if options.preset == "smoke" else ROWS)
+    say(f"planner_benchmark: runs in {rows_in}; the result goes to {folder}")
+    planners = PLANNERS | {name: _always(load_object(name)) for name in options.planner}
+    chosen = tuple(SMOKE if options.preset == "smoke" else planners)
+    if not options.join:
+        until = time.monotonic() + 60.0 * options.minutes
+        part, parts = (int(number) for number in options.shard.split("/"))
+        everything = runs(options.preset, chosen)
+        todo = [
+            run
+            for pattern in options.only or ["*"]
+            for run in everything
+            if fnmatch.fnmatchcase(run.name, pattern)
+        ]
+        shown = SMOKE if options.preset == "smoke" else planners
+        # All of an instance go to one machine, which then has what they are compared with.
+        places = list(dict.fromkeys((run.instance, run.seed) for run in todo))
+        mine = set(places[part - 1 :: parts])
+        work([r for r in todo if (r.instance, r.seed) in mine], rows_in, shown, until)
+    rows = [json.loads(path.read_text()) for path in sorted(rows_in.glob("*.json"))]
+    # The best plans known so far: those in the folder, or else the committed ones.
+    committed = [] if options.preset == "smoke" else [RESULTS / BEST]
+    known = next((path for path in (folder / BEST, *committed) if path.exists()), None)
+    lines = ",\n".join(
+        json.dumps(one)
+        for one in best_plans(rows, [] if known is None else json.loads(known.read_text()))
+    )
+    write_text_atomic(folder / BEST, f"[{lines}]\n")
+    write_result("planner_benchmark", options.preset, run(options.preset, rows), folder)
 
 
 # Few trials each: whether all goes through, and not what it comes to.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import wlplan
+from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.constants import ACTION_HIGH, ACTION_LOW, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 from wlplan.dataset.episode import Episode, choose_pose
@@ -147,7 +147,7 @@ def _compared(cases: tuple[np.ndarray, np.ndarray, np.ndarray]) -> _Compared:
         values.append(value.T)
         reasons.append(int(reason[0]))
         if n % 20 == 0:
-            print(f"{n} of {len(cases[0])} cycles", file=sys.stderr)
+            say(f"{n} of {len(cases[0])} cycles")
     here, *there = np.split(np.array(values), [1, 8, 15, 22], axis=-1)
     forward = {name: (there[2 * k] - here) / step for k, (name, step) in enumerate(STEPS.items())}
     backward = {
