@@ -69,6 +69,7 @@ def test_another_default_is_another_model(tmp_path: Path, monkeypatch: pytest.Mo
     assert len([path for path in tmp_path.iterdir() if path.is_dir()]) == 2
 
 
+@pytest.mark.slow
 def test_a_training_that_was_cut_short_has_no_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

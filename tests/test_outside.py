@@ -87,6 +87,7 @@ def command(folder: Path, *words: object) -> dict[str, Any]:
     return document
 
 
+@pytest.mark.slow
 def test_planner_objective_and_world_run_from_the_command_line(folder: Path) -> None:
     document = command(
         folder,

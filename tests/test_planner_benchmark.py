@@ -55,6 +55,7 @@ def test_a_budget_is_spent_and_kept() -> None:
     assert within.predicted <= few.predicted
 
 
+@pytest.mark.slow
 def test_half_a_plan_is_none() -> None:
     asked, watch = job(), Watch()
     GREEDY.propose(asked, 2, seed=0, progress=watch)
@@ -163,7 +164,9 @@ def test_what_was_run_is_run_again_only_with_other_settings(
     assert json.loads(place.read_text()) == {"anew": True}
 
 
-@pytest.mark.parametrize("name", ["prism 0", "cone", "bundled"])
+@pytest.mark.parametrize(
+    "name", ["cone", *(pytest.param(one, marks=pytest.mark.slow) for one in ("prism 0", "bundled"))]
+)
 def test_walls_stand_around_the_soil_and_leave_the_west_open(name: str) -> None:
     instance = Instance(name, "15 loads", "walls")
     pile = instance.load_pile()
