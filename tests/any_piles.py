@@ -116,7 +116,9 @@ def _seen(
     return np.ones_like(x, bool)
 
 
-def plan_of(places: tuple[str, ...], seed: int, cells: int, dtype: type = np.float32) -> LoadingPlan:
+def plan_of(
+    places: tuple[str, ...], seed: int, cells: int, dtype: type = np.float32
+) -> LoadingPlan:
     """A plan with a load at a place of each sort, headings and actions anywhere in their range.
 
     Args:

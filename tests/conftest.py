@@ -18,24 +18,15 @@ os.environ.setdefault(
     "--xla_cpu_use_fusion_emitters=false",
 )
 
+import examples
 import jax
 import jaxtyping
 import pytest
 from browsers import browser as browser
-from hypothesis import HealthCheck, settings
 
 jaxtyping.install_import_hook("wlplan", "beartype.beartype")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# The same few examples every time; `make fuzz` goes on with others.
-settings.register_profile(
-    "tests",
-    derandomize=True,
-    max_examples=10,
-    deadline=None,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
-)
-settings.load_profile("tests")
+examples.load_profile()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -34,7 +34,7 @@ from wlplan.site.presets import machine_named, machine_recorded, soil_named, soi
 CORPUS = Path(__file__).parent / "corpus"
 FILES = sorted(path for path in CORPUS.rglob("*") if path.is_file())
 # Most seconds that a file of some kB may take, and memory beyond what there is at first [bytes].
-MOST_SECONDS, MOST_MEMORY = 10, 2**31
+MOST_SECONDS, MOST_MEMORY = 30, 2**31
 
 
 def read_plan_whole(path: Path) -> None:

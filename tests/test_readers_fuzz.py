@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scene
+from examples import examples
 from hypothesis import given, settings
 from mutations import Edit, edited, edits
 from scan_files import write_las, write_ply, write_tif
@@ -24,6 +25,8 @@ ROWS = scene.points(6.0)
 ROWS = ROWS[(ROWS[:, 0] > 17.0) & (ROWS[:, 1] < 7.0)]
 HEIGHTS = scene.grid(0.4)[42:, :18]
 FACES = 2.0 * scene.triangles()[-72:]
+# Where a file is kept that ends in something else, to be named and added to tests/corpus/scans.
+FOUND = Path(__file__).parents[1] / "out" / "fuzz"
 SMALL = {"elevation": HEIGHTS}
 
 
@@ -116,8 +119,15 @@ def read_or_refused(name: str, changes: list[Edit]) -> str:
     """What becomes of that file after changes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"a{name}"
-        path.write_bytes(broken(name, changes))
-        return outcome(path)
+        content = broken(name, changes)
+        path.write_bytes(content)
+        try:
+            return outcome(path)
+        except BaseException:
+            # For `make fuzz`, which says where it lies: the last one written is the smallest.
+            FOUND.mkdir(parents=True, exist_ok=True)
+            (FOUND / f"found{'' if name[0] == '.' else '-'}{name}").write_bytes(content)
+            raise
 
 
 def test_every_ending_has_a_file_to_break() -> None:
@@ -132,11 +142,11 @@ def test_broken_files_end_in_a_pile_or_in_one_line(
     assert capfd.readouterr() == ("", "")
 
 
-def search(name: str, examples: int) -> int:
+def search(name: str, few: int) -> int:
     """Reads so many broken files; returns how many of them were refused."""
     refused = 0
 
-    @settings(max_examples=examples)
+    @settings(max_examples=examples(few))
     @given(changes=edits())
     def each(changes: list[Edit]) -> None:
         nonlocal refused

@@ -333,7 +333,11 @@ def _ensemble_of_dict(record: Mapping[str, Any] | None) -> tuple[int, jax.Array]
     if record is None:
         return 0, on_device(np.ones(3, np.float32))
     factor = np.array(record["factor"], np.float32)
-    if not 2 <= record["members"] <= _MOST_MEMBERS or factor.shape != (3,) or not (factor > 0.0).all():
+    if (
+        not 2 <= record["members"] <= _MOST_MEMBERS
+        or factor.shape != (3,)
+        or not (factor > 0.0).all()
+    ):
         raise ValueError("the record of the ensemble makes no sense")
     return int(record["members"]), on_device(factor)
 
