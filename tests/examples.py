@@ -1,4 +1,4 @@
-"""How many examples hypothesis tries: few and always the same, or as `make fuzz` asks for others."""
+"""How many examples hypothesis tries: few and always the same, or many for `make fuzz`."""
 
 from __future__ import annotations
 

@@ -51,9 +51,7 @@ def main() -> int:
             print(said)
     files = sorted(path.name for path in (HERE.parent / "out" / "fuzz").glob("found*"))
     for name in files:
-        print(
-            f"out/fuzz/{name}: name it after what is wrong with it, and add it to tests/corpus/scans"
-        )
+        print(f"out/fuzz/{name}: name it after what is wrong, and add it to tests/corpus/scans")
     print("found nothing" if not found else f"{found} runs found something, see above")
     return min(found, 1)
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scene
 import test_readers_fuzz as scans
 from flax import nnx
 from scan_files import write_tif

@@ -81,7 +81,7 @@ class TooSlowError(BaseException):
 
 
 def outcome(read: Callable[[Path], object], path: Path) -> str:
-    """ "read", or the line that a file was refused with; any other error goes on."""
+    """Says "read", or the line that a file was refused with; any other error goes on."""
 
     def too_slow(*_: int | FrameType | None) -> None:
         raise TooSlowError(f"{path} takes longer than {MOST_SECONDS} s")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import types
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +90,7 @@ def words(draw: st.DrawFn, command: click.Command) -> list[str]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where commands run: with a plan, a file and a folder; the work is stood in for."""
     (tmp_path / "plan.json").write_text(json.dumps(PLAN))
     (tmp_path / "scan.npz").write_bytes(b"x")
@@ -106,7 +105,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setattr("wlplan.cli.planning.pile_named", lambda *_: types.SimpleNamespace())
     monkeypatch.setattr("wlplan.cli.planning.world_named", lambda *_: None)
     monkeypatch.setattr("wlplan.cli.planning.site_recorded", _reached)  # `simulate` reads the pile
-    yield tmp_path
+    return tmp_path
 
 
 def run(given: list[str], capsys: pytest.CaptureFixture[str]) -> str:

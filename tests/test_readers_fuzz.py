@@ -93,9 +93,11 @@ def outcome(path: Path) -> str:
     try:
         read_pile(path)
     except InputError as error:
-        assert "\n" not in str(error)
-        return str(error)
-    return "read"
+        said = str(error)
+    else:
+        said = "read"
+    assert "\n" not in said
+    return said
 
 
 @functools.cache

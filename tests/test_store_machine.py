@@ -120,9 +120,11 @@ class Collections(RuleBasedStateMachine):
 
     @initialize()
     def patch(self) -> None:
+        """Puts the stand-ins in place."""
         self.patched.enter_context(stand_ins())
 
     def teardown(self) -> None:
+        """Takes them away, and the folder too."""
         self.patched.close()
         shutil.rmtree(self.place)
 
