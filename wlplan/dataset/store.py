@@ -333,11 +333,12 @@ def open_dataset(path: str | os.PathLike[str]) -> Dataset:
             array = group[name]
             if not isinstance(array, zarr.Array) or array.nchunks_initialized < array.nchunks:
                 raise ValueError(f"parts of {name} are missing")
+            # Before it is read: a few bytes may say that they are an array of any size.
+            if array.shape != (cycles, *variable.shape):
+                raise ValueError(f"{name} has shape {array.shape}")
             if not np.can_cast(array.dtype, variable.dtype, "same_kind"):
                 raise ValueError(f"{name} is of type {array.dtype}")
             columns[name] = np.asarray(array[...])
-            if columns[name].shape != (cycles, *variable.shape):
-                raise ValueError(f"{name} has shape {columns[name].shape}")
     except Exception as error:
         # Damaged chunks make the decoders raise almost anything; to the user it means the same.
         what = one_line(error)

@@ -47,6 +47,10 @@ _FIELDS = {
     **dict.fromkeys(("dataset", "training", "versions", "held_out"), dict),
 }
 
+# Most hidden layers of a network, most units of each, and most members of an ensemble: a network is
+# built before its weights are read, and a description may name any number.
+_MOST_LAYERS, _MOST_UNITS, _MOST_MEMBERS = 64, 1 << 16, 1000
+
 
 class _Kind(NamedTuple):
     """What belongs to a kind of model. Its name is what is saved; those of the classes are not."""
@@ -103,7 +107,12 @@ def architecture(network: Any) -> dict[str, Any]:
 
 
 def _network(kind: str, record: Mapping[str, Any]) -> Any:
-    arguments = {**record, "hidden": tuple(record["hidden"])}
+    hidden = record["hidden"]
+    if len(hidden) > _MOST_LAYERS or not all(
+        type(units) is int and 0 < units <= _MOST_UNITS for units in hidden
+    ):
+        raise ValueError(f"its hidden layers are {hidden}")
+    arguments = {**record, "hidden": tuple(hidden)}
     # The record of the ψ_low that ships says that it is standardised, as all are.
     arguments.pop("standardised", None)
     return _KINDS[kind].network(rngs=nnx.Rngs(0), **arguments)
@@ -330,7 +339,11 @@ def _ensemble_of_dict(record: Mapping[str, Any] | None) -> tuple[int, dict[str, 
     factor = np.array(record["factor"], np.float32)
     # Models of before had none.
     bias = np.array(record.get("bias", np.zeros(3)), np.float32)
-    if record["members"] < 2 or factor.shape != (3,) or not (factor > 0.0).all():
+    if (
+        not 2 <= record["members"] <= _MOST_MEMBERS
+        or factor.shape != (3,)
+        or not (factor > 0.0).all()
+    ):
         raise ValueError("the record of the ensemble makes no sense")
     if bias.shape != (3,) or not np.isfinite(bias).all():
         raise ValueError("the bias of the ensemble makes no sense")

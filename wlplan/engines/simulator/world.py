@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from wlplan.constants import J_PER_KJ, KG_PER_TONNE
+from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
 from wlplan.engines.simulator.cycle import Cycle, Settings, dig
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, Soil
@@ -104,7 +104,7 @@ class Simulator(struct.PyTreeNode):
             The pile after, relaxed, the performance, and how the automaton ended.
         """
         window, start = window_of(pile, pose)
-        dug, missing = _written(window, pose, height, cycle)
+        dug, missing, left = _written(window, pose, height, cycle)
         settled = settle_dug(
             pile,
             dug,
@@ -112,27 +112,37 @@ class Simulator(struct.PyTreeNode):
             repose_angle=self.soil.repose_angle,
             schedule=self.schedule,
         )
-        performance = _performance(cycle, missing, self.soil)
+        performance = _performance(cycle, left, self.soil)
         report = SolveReport(settled.rounds, settled.at_rest, settled.steepest_slope, missing)
         return settled.pile, performance, report
 
 
 def _written(
     window: Pile, pose: Pose, height: Float[Array, "52 52"], cycle: Cycle
-) -> tuple[Float[Array, "n m"], Float[Array, ""]]:
-    """The part of the pile around a loading before it slides, and what is missing of it [m^3]."""
+) -> tuple[Float[Array, "n m"], Float[Array, ""], Float[Array, ""]]:
+    """A loading written back to the part of the pile around it, before that slides.
+
+    Returns:
+        The part after [m]; what was to leave it and has not, since the loader dug beyond the edge
+        of the map or deeper than there is soil [m^3]; and what has left it [m^3].
+    """
     change = cycle.height - height
-    return add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+    # Rounding, step by step, may leave some 200 g more than was there, and no load.
+    lost, gained = jnp.maximum(-change, 0.0).sum(), jnp.maximum(change, 0.0).sum()
+    share = jnp.where(gained > lost, lost / jnp.where(gained > lost, gained, 1.0), 1.0)
+    change = jnp.where(change > 0.0, share * change, change)
+    dug, missing = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+    return dug, missing, CELL_SIZE**2 * (lost - share * gained) - missing
 
 
-def _performance(cycle: Cycle, missing: Float[Array, ""], soil: Soil) -> Performance:
-    """What a cycle yields; the load is what left the grid.
+def _performance(cycle: Cycle, left: Float[Array, ""], soil: Soil) -> Performance:
+    """What a cycle yields; the load is what left the grid [m^3].
 
-    The loader may have dug beyond the edge of the map, or deeper than there is soil. Rounding of
-    the time stepping goes to the mass.
+    That is not `cycle.mass`: in float32 a bucket that pushes until its time is up may count some
+    200 g too much, step by step.
     """
     work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
-    mass = jnp.maximum(cycle.mass - soil.density * missing, 0.0)
+    mass = jnp.maximum(soil.density * left, 0.0)
     return Performance(mass=mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ)
 
 
@@ -155,8 +165,8 @@ def _dig(
 def _foresee(simulator: Simulator, pile: Pile, pose: Pose, action: Action) -> Performance:
     height, cycle = _dig(simulator, pile, pose, action)
     window, _ = window_of(pile, pose)
-    _, missing = _written(window, pose, height, cycle)
-    return _performance(cycle, missing, simulator.soil)
+    *_, left = _written(window, pose, height, cycle)
+    return _performance(cycle, left, simulator.soil)
 
 
 @jax.jit
