@@ -131,11 +131,14 @@ def _index(place: float) -> int:
 
 
 def _errors(told: np.ndarray, truth: np.ndarray) -> dict[str, dict[str, float]]:
-    """Mean relative errors [1] at the toe, and elsewhere."""
+    """Mean relative errors [1] at the toe, and elsewhere, of loads worth the name."""
     error = np.abs(told - truth) / np.maximum(np.abs(truth), 1e-3)
-    toe = SHIFTS == 0.0
+    toe, loaded = SHIFTS == 0.0, truth[..., 0] >= LOADED
     return {
-        where: {name: _rounded(float(error[:, which, k].mean())) for k, name in enumerate(OUTCOMES)}
+        where: {
+            name: _rounded(float(error[..., k][loaded & which].mean()))
+            for k, name in enumerate(OUTCOMES)
+        }
         for where, which in (("at_the_toe", toe), ("elsewhere", ~toe))
     }
 

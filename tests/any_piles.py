@@ -67,9 +67,9 @@ def _soil(
     if base == "level":
         return 0.0 * x
     if base == "layer":
-        return np.where(np.hypot(x, y) < 0.6 * reach, random.uniform(0.001, 0.2), 0.0)
+        return np.asarray(random.uniform(0.001, 0.2) * (np.hypot(x, y) < 0.6 * reach))
     if base == "cone":
-        return 0.35 * reach - random.uniform(0.4, 0.9) * np.hypot(x, y) + bumps
+        return np.asarray(0.35 * reach - random.uniform(0.4, 0.9) * np.hypot(x, y) + bumps)
     if base == "ridge":  # as far as the border
         return 0.3 * reach - 0.5 * np.abs(x * math.cos(0.3) + y * math.sin(0.3))
     if base == "rough":  # far too steep: most of it slides
@@ -108,7 +108,7 @@ def _seen(
 ) -> np.ndarray:
     """Cells that the scan saw."""
     if kind == "corner":
-        return x + y > -0.8 * reach
+        return np.asarray(x + y > -0.8 * reach)
     if kind == "spots":
         return random.uniform(size=x.shape) > 0.05
     if kind == "half":
@@ -153,5 +153,5 @@ def _load(place: str, reach: float, random: np.random.Generator) -> list[float]:
 def random_sort(random: np.random.Generator) -> Sort:
     """One of all sorts; few of them are empty."""
     left = random.choice([1.0, random.uniform(0.0, 0.1), 0.0], p=[0.8, 0.15, 0.05])
-    names = (str(random.choice(names)) for names in (BASES[1:], FLOORS, MASKS))
-    return Sort(*names, float(left), int(random.integers(2**31)))
+    base, floor, mask = (str(random.choice(names)) for names in (BASES[1:], FLOORS, MASKS))
+    return Sort(base, floor, mask, float(left), int(random.integers(2**31)))

@@ -196,7 +196,7 @@ def recordings() -> Named:
 
 # --- documents
 
-LOAD = {
+LOAD: dict[str, Any] = {
     **dict.fromkeys(("x", "y", "heading"), 0.0),
     "action": dict.fromkeys(("delta_bm", "k_bm", "delta_bk", "k_bk"), 0.5),
 }
@@ -279,8 +279,8 @@ def areas() -> Named:
     """Files that are to hold polygons."""
     ring = [[0.0, 0.0], [5.0, 0.0], [5.0, 5.0], [0.0, 0.0]]
 
-    def of(coordinates: Any, kind: str = "Polygon", **properties: Any) -> bytes:
-        geometry = {"type": kind, "coordinates": coordinates}
+    def of(coordinates: Any, shape: str = "Polygon", **properties: Any) -> bytes:
+        geometry = {"type": shape, "coordinates": coordinates}
         return json.dumps({"geometry": geometry, "properties": properties}).encode()
 
     for name, content in {
@@ -362,7 +362,7 @@ def models() -> Named:
     yield "weights-changed", archive(files | {data: b"\0" + files[data][1:]})
     yield "weights-empty", archive(files | {data: b""})
     yield "one-file-more", archive(files | {"weights/more": b"x"})
-    for name, fields in {
+    damages: dict[str, dict[str, Any]] = {
         "format-of-tomorrow": {"format": "wlplan.model/99"},
         "kind-of-nothing": {"kind": "psi_none"},
         "kind-a-list": {"kind": []},
@@ -377,7 +377,8 @@ def models() -> Named:
         "low-1e300": {"normaliser__inputs__low": [1e300] * 8},
         "normaliser-of-two": {"normaliser__outputs__low": [0.0, 0.0]},
         "files-name-others": {"files": {"../../x": "0"}},
-    }.items():
+    }
+    for name, fields in damages.items():
         yield name, archive(changed(files, card, fields))
 
 
@@ -405,7 +406,7 @@ def stores() -> Named:
     yield "array-missing", archive({n: c for n, c in files.items() if not n.startswith("mass/")})
     yield "group-no-json", archive(files | {group: b"group"})
     yield "array-no-json", archive(files | {mass: b"array"})
-    for name, fields in {
+    damages: dict[str, dict[str, Any]] = {
         "cycles-a-trillion": {"attributes__cycles": 10**12, "attributes__cycles_done": 10**12},
         "cycles-negative": {"attributes__cycles": -1, "attributes__cycles_done": -1},
         "cycles-text": {"attributes__cycles": "2"},
@@ -416,9 +417,10 @@ def stores() -> Named:
         "attributes-null": {"attributes": None},
         "zarr-of-version-9": {"zarr_format": 9},
         "a-shard": {"attributes__shard": 1, "attributes__shards": 2},
-    }.items():
+    }
+    for name, fields in damages.items():
         yield name, archive(changed(files, group, fields))
-    for name, fields in {
+    of_array: dict[str, dict[str, Any]] = {
         "array-of-text": {"data_type": "string"},
         "array-of-a-trillion": {"shape": [10**12]},
         "array-negative": {"shape": [-2]},
@@ -428,7 +430,8 @@ def stores() -> Named:
         "codec-unknown": {"codecs": [{"name": "rot13"}]},
         "no-codec": {"codecs": []},
         "kind-of-group": {"node_type": "group"},
-    }.items():
+    }
+    for name, fields in of_array.items():
         # Readers look at the copy of it in the group first.
         copy = {f"consolidated_metadata__metadata__mass__{k}": v for k, v in fields.items()}
         yield name, archive(changed(changed(files, mass, fields), group, copy))

@@ -51,7 +51,8 @@ def pile_of(sort: Sort, dtype: type = np.float32) -> Pile:
 
 def pose_of(place: str, seed: int, dtype: type = np.float32) -> Pose:
     plan = any_piles.plan_of((place,), seed, CELLS, dtype)
-    return jax.tree.map(lambda leaf: leaf[0], plan.pose)
+    pose: Pose = jax.tree.map(lambda leaf: leaf[0], plan.pose)
+    return pose
 
 
 def change_of(seed: int, dtype: type = np.float32) -> jax.Array:
@@ -132,7 +133,7 @@ def stacked(trees: list[Any]) -> Any:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
-TURNS = {
+TURNS: dict[str, Callable[[Any], Any]] = {
     "a quarter turn": lambda field: np.rot90(field),
     "half a turn": lambda field: np.rot90(field, 2),
     "a mirror": lambda field: field[::-1],
@@ -321,7 +322,9 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "paste": paste,
     "excavate": functools.partial(excavate, width=WIDTH),
     "sample_local": lambda pile, pose: sample_local(pile, pose).height,
-    "add_local_change": lambda *rows: add_local_change(*rows, 1.0),
+    "add_local_change": lambda height, pile, pose, change: add_local_change(
+        height, pile, pose, change, 1.0
+    ),
     "settle_dug": _settle_dug,
 }
 ARGUMENTS = {"paste": 3, "excavate": 3, "sample_local": 2, "add_local_change": 4, "settle_dug": 3}

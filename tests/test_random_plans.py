@@ -51,7 +51,8 @@ def test_what_is_loaded_is_what_left_the_pile(name: str, request: pytest.Fixture
 
     @jax.jit
     def play(pile: Pile, plan: LoadingPlan) -> Rollout:
-        return jax.lax.map(lambda row: rollout(world, *row), (pile, plan))
+        played: Rollout = jax.lax.map(lambda row: rollout(world, *row), (pile, plan))
+        return played
 
     worst, empty, wrong = 0.0, 0, list[str]()
     for start in range(0, plans, AT_ONCE):
