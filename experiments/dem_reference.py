@@ -263,6 +263,7 @@ def _repeats(
     between = float(misplaced(after[i], after[j]).mean())
     return {
         "pairs": len(alike),
+        "scatter": _scatter(reference),
         "misplaced_between_packings_m3": between,
         "misplaced_ours_m3": float(volume[members].mean()),
         "ratio": float(volume[members].mean() / between),
@@ -278,6 +279,34 @@ def _repeats(
             name: float(np.median(np.abs(ours[name] / reference[f"{name}_{unit}"] - 1.0)[members]))
             for name, unit in _UNITS.items()
         },
+    }
+
+
+def _scatter(reference: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Deviations and correlations of the logarithms among packings, on surfaces without a stall.
+
+    What `wlplan.worlds.scattered` draws from.
+    """
+    logarithms = np.log(np.stack([reference[f"{n}_{u}"] for n, u in _UNITS.items()], axis=1))
+    apart, freedom = [], 0
+    for surface in np.unique(reference["pile_id"]):
+        members = reference["pile_id"] == surface
+        packings = len(np.unique(reference["packing"][members]))
+        # Two loadings of one pile are no repeats.
+        repeats = (
+            packings == members.sum() > 1 and not np.ptp(reference["action"][members], axis=0).any()
+        )
+        if repeats and not (reference["stop_reason"][members] == "timeout").any():
+            apart.append(logarithms[members] - logarithms[members].mean(axis=0))
+            freedom += packings - 1
+    all_of_them = np.concatenate(apart or [np.zeros((0, len(_UNITS)))])
+    covariance = all_of_them.T @ all_of_them / max(freedom, 1)
+    deviation = np.sqrt(np.diag(covariance))
+    return {
+        "surfaces": len(apart),
+        "cycles": len(all_of_them),
+        "deviation": dict(zip(_UNITS, deviation.tolist(), strict=True)),
+        "correlation": (covariance / np.maximum(np.outer(deviation, deviation), 1e-12)).tolist(),
     }
 
 

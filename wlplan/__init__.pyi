@@ -55,6 +55,7 @@ from .types import Rollout as Rollout
 from .types import World as World
 from .worlds.capabilities import world as world
 from .worlds.learned import LearnedWorld as LearnedWorld
+from .worlds.scattered import scattered as scattered
 from .worlds.shipped import load_world as load_world
 
 __version__: str

@@ -301,6 +301,14 @@ engine_option = click.option(
     help="Engine that plays the plan: the simulator, or discrete elements, which take minutes a "
     "load and need wlplan[dem].",
 )
+scatter_option = click.option(
+    "--scatter",
+    metavar="SEED",
+    type=click.IntRange(0, 2**31 - 1),
+    default=None,
+    help="Play with the scatter of real grains, drawn from this seed: some percent in mass, one in "
+    "time and work. Several seeds show what a plan's totals vary by.",
+)
 model_options = (
     click.option(
         "--model",

@@ -32,6 +32,7 @@ from wlplan.cli.options import (
     pile_argument,
     placed_truck_option,
     planner_option,
+    scatter_option,
     site_options,
     truck_option,
     with_options,
@@ -206,12 +207,18 @@ def _print_written(folder: Path | None, written: list[str] | None) -> None:
 @pile_argument(required=True)
 @click.argument("plan_file", metavar="PLAN.json")
 @with_options(
-    engine_option, truck_option, *site_options("that of the plan"), out_option, also_option
+    engine_option,
+    scatter_option,
+    truck_option,
+    *site_options("that of the plan"),
+    out_option,
+    also_option,
 )
 def simulate(
     pile_file: PileFile,
     plan_file: str,
     engine: str,
+    scatter: int | None,
     truck: tuple[float, ...] | None,
     soil: str | None,
     machine: str | None,
@@ -225,13 +232,18 @@ def simulate(
     With --out: plan.json, plan.png, totals.png and report.html, of the plan as it was played.
 
     Truck, soil and machine are those of the plan, unless given. No engine has randomness, so
-    --seed changes nothing. If interrupted, the same command with --engine dem continues where it
-    was.
+    --seed changes nothing; --scatter gives the simulator that of real grains. If interrupted, the
+    same command with --engine dem continues where it was.
     """
     if engine == "dem" and "gif" in also:
         raise InputError(
             "discrete elements keep no pile between the loads: leave out --also gif, or play the "
             "plan in the simulator."
+        )
+    if engine == "dem" and scatter is not None:
+        raise InputError(
+            "discrete elements have a scatter of their own: leave out --scatter, or play the plan "
+            "in the simulator."
         )
     check_pile_name(pile_file.name)
     site_named(soil, machine)  # wrong options are refused before anything heavy is imported
@@ -246,6 +258,7 @@ def simulate(
     from wlplan.planning.plan import play
     from wlplan.report.document import deviation_of, plan_document, write_plan_folder
     from wlplan.site.frame import frame_recorded
+    from wlplan.worlds.scattered import scattered
 
     loading_plan, given = read_plan(plan_file)
     recorded = site_recorded(given, plan_file)
@@ -290,9 +303,12 @@ def simulate(
             progress(engine, number, count, None)
 
         progress(engine, 0, count, None)
+        simulator = world_named(engine, site)
+        if scatter is not None:
+            simulator = scattered(simulator, seed=scatter)
         played = ready(
             play(
-                simulator := world_named(engine, site),
+                simulator,
                 pile,
                 loading_plan,
                 objective=objective,
@@ -307,6 +323,8 @@ def simulate(
 
     predicted = _predicted_of(given)
     by: dict[str, Any] = {"engine": engine} if cycles else {}
+    if scatter is not None:
+        by["scatter"] = scatter
     document = plan_document(
         pile,
         played,
