@@ -112,20 +112,19 @@ def add_row_options(parser: argparse.ArgumentParser, rows: Path) -> None:
     )
 
 
-def chosen(every: Sequence[AnyNamed], options: argparse.Namespace) -> list[AnyNamed]:
-    """Those of the rows that the options ask for, in the order in which they do.
+def matching(every: Sequence[AnyNamed], patterns: Sequence[str] | None) -> list[AnyNamed]:
+    """What makes the rows whose names match, those of the first pattern first.
 
     Args:
-        every: What makes the rows.
-        options: As `add_row_options` has them.
+        every: What makes all rows.
+        patterns: As file names have them in a shell; None: every name matches.
     """
-    wanted = [
+    return [
         one
-        for pattern in options.only or ["*"]
+        for pattern in patterns or ["*"]
         for one in every
         if fnmatch.fnmatchcase(one.name, pattern)
     ]
-    return part_of(wanted, options.shard)
 
 
 def part_of(items: Sequence[Item], shard: tuple[int, int]) -> list[Item]:

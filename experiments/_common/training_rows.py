@@ -16,7 +16,13 @@ from flax import nnx
 
 from experiments._common.places import add_places, folder_of, say
 from experiments._common.results import DATA, open_or_collect, redraw, write_result
-from experiments._common.row_files import RowFiles, add_row_options, chosen, time_is_up
+from experiments._common.row_files import (
+    RowFiles,
+    add_row_options,
+    matching,
+    part_of,
+    time_is_up,
+)
 from wlplan import training
 from wlplan.dataset import Dataset, fingerprint
 from wlplan.errors import InputError
@@ -139,7 +145,8 @@ def main(
         every = trainings(options.preset)
         if not options.join:
             todo = [one for one in every if options.whole or smoke or first(one)]
-            _make(chosen(todo, options), rows, data, time_is_up(options))
+            mine = part_of(matching(todo, options.only), options.shard)
+            _make(mine, rows, data, time_is_up(options))
         found = {one.name: rows.read(one.name, made_with(one.settings, data)) for one in every}
         there = {key: row for key, row in found.items() if row is not None}
         write_result(name, options.preset, run(options.preset, data, there), folder)
