@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 LOGS = Path("out") / "spread"
 CLUSTERS = ("local", "slurm")
+# How often a job whose time is over is queued again.
+_MOST_TIMES = 100
 # Between two looks at how the jobs are [s].
 _LOOK = 1.0
 
@@ -117,7 +119,9 @@ def start(
             f"the {cores()} of this machine: start {max(cores() // cores_each, 1)} at most."
         )
     try:
-        executor = submitit.AutoExecutor(folder=logs, cluster=cluster)
+        executor = submitit.AutoExecutor(
+            folder=logs, cluster=cluster, slurm_max_num_timeout=_MOST_TIMES
+        )
     except RuntimeError as error:
         raise InputError("Slurm is not here: start this where `srun` can be called.") from error
     executor.update_parameters(
