@@ -207,7 +207,9 @@ def draw(folder: Path) -> None:
         _lines(panel, over_size, "parameters", name, factor)
         panel.set_yscale("log")
         panel.set_title(title, fontsize=8)
-    for row_of, label in zip(panels, ("cycles to train on", *["weights"] * 2), strict=True):
+    for row_of, label in zip(
+        panels, ("cycles for training and validation", *["weights"] * 2), strict=True
+    ):
         for panel in row_of:
             panel.set_xscale("log")
             panel.set_xlabel(label, fontsize=8, color=FAINT)

@@ -188,10 +188,9 @@ def _shipped(kind: str, data: Dataset) -> dict[str, Any]:
     """What ships, on the cycles that models which are split by pile are held to."""
     model, description = load_pretrained(kind)
     errors = evaluate_performance(model, split(data)[2]).every.mean_relative
-    settings = description["training"]["settings"]
-    layers = " x ".join(map(str, (len(settings["hidden"]), settings["hidden"][0])))
+    hidden = description["architecture"]["hidden"]
     return {
-        "change": f"as it ships: {settings['members']} members, {layers}",
+        "change": f"as it ships: an ensemble of {len(hidden)} x {hidden[0]}",
         "part": "data and network",
         "trainings": 1,
         "cycles": sum(description["training"]["cycles"][:2]),

@@ -201,7 +201,8 @@ def test_patience_ends_a_training_that_gets_no_better(data: Dataset, tmp_path: P
 
 
 def test_a_training_that_still_gets_better_goes_on_to_its_end() -> None:
-    fits = [fitting.Fit(*[None] * 5, jnp.asarray(epoch)) for epoch in (5, 2, [2, 5])]
+    others = dict.fromkeys(("params", "rest", "optimiser", "best", "best_loss"))
+    fits = [fitting.Fit(**others, best_epoch=jnp.asarray(epoch)) for epoch in (5, 2, [2, 5])]
     assert [fitting._is_converged(fit, 6, 3) for fit in fits] == [False, True, False]
     assert not fitting._is_converged(fits[1], 1000, 0)
 
