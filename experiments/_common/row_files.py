@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import fnmatch
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -55,11 +56,8 @@ class RowFiles:
         """
         if (row := self.read(name, made_with)) is not None:
             return row
-        locks = self.folder / ".locks"
-        locks.mkdir(parents=True, exist_ok=True)
         try:
-            # The system takes it from a process that dies.
-            with filelock.FileLock(locks / name, timeout=0):
+            with self.alone(name, wait=False):
                 # Another process may have made it between the two.
                 if (row := self.read(name, made_with)) is not None:
                     return row
@@ -69,6 +67,23 @@ class RowFiles:
                 return made
         except filelock.Timeout:
             return None
+
+    @contextlib.contextmanager
+    def alone(self, name: str, *, wait: bool = True) -> Iterator[None]:
+        """While the block runs, no other process is in one of this folder and name.
+
+        Args:
+            name: Of what is done.
+            wait: Whether to wait until no other is.
+
+        Raises:
+            filelock.Timeout: If another is, and it is not waited for.
+        """
+        locks = self.folder / ".locks"
+        locks.mkdir(parents=True, exist_ok=True)
+        # The system takes it from a process that dies.
+        with filelock.FileLock(locks / name, timeout=-1 if wait else 0):
+            yield
 
     def all(self) -> list[dict[str, Any]]:
         """All rows that are there, whatever they were made with."""

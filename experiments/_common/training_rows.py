@@ -141,7 +141,9 @@ def main(
         rows = RowFiles(options.rows or (folder / name if smoke else Path("out") / name))
         say(f"{name}: rows in {rows.folder}; the result goes to {folder}")
         path = options.data or (folder / DATA.name if smoke else DATA)
-        data = open_or_collect(path, options.preset)
+        # Parts that are started together find the data that the first of them collects.
+        with rows.alone("data set"):
+            data = open_or_collect(path, options.preset)
         every = trainings(options.preset)
         if not options.join:
             todo = [one for one in every if options.whole or smoke or first(one)]
