@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter
 
 from experiments._common.results import dataset_summary
 from experiments._common.training_rows import main
@@ -206,19 +207,28 @@ def draw(folder: Path) -> None:
     for (title, name, factor), panel in zip(times, panels[2], strict=True):
         _lines(panel, over_size, "parameters", name, factor)
         panel.set_yscale("log")
+        # Whole decades, so that two of them at least are labelled.
+        low, high = np.log10(panel.get_ylim())
+        panel.set_ylim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))
         panel.set_title(title, fontsize=8)
     for row_of, label in zip(
         panels, ("cycles for training and validation", *["weights"] * 2), strict=True
     ):
         for panel in row_of:
             panel.set_xscale("log")
+            for axis in (panel.xaxis, panel.yaxis):
+                axis.set_minor_formatter(NullFormatter())
             panel.set_xlabel(label, fontsize=8, color=FAINT)
             tidy(panel)
-    for panel in panels[:2].flat:
-        # A network of one narrow layer errs by several times as much as any other.
-        panel.set_ylim(0.0, 25.0)
+    # What few cycles or a narrow network come to, beyond that, says nothing about the others.
+    for above, below in zip(*panels[:2], strict=True):
+        above.set_xlim(80.0, 12_000.0)
+        above.set_ylim(0.0, 25.0)
+        below.set_ylim(0.0, 12.0)
     handles = [
-        Line2D([], [], color=_COLOUR[kind], label=_title(kind, units, samples)) for kind in KINDS
+        Line2D([], [], color=_COLOUR[kind], label=_title(kind, units, samples))
+        for kind in KINDS
+        if any(row["kind"] == kind for row in rows)
     ]
     handles += [
         Line2D([], [], color=FAINT, ls=style, label=f"{n} hidden layer{'s' if n > 1 else ''}")

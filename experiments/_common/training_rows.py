@@ -48,9 +48,14 @@ class Training(Protocol):
 AnyTraining = TypeVar("AnyTraining", bound=Training)
 
 
-def made_with(settings: PerformanceSettings, data: Dataset) -> dict[str, Any]:
-    """What the row of a training hangs on."""
-    return {"settings": settings.as_dict(), "dataset": fingerprint(data), "versions": versions()}
+def made_with(settings: PerformanceSettings, data_mark: str) -> dict[str, Any]:
+    """What the row of a training hangs on.
+
+    Args:
+        settings: How it is trained.
+        data_mark: Fingerprint of the data set, which takes a while to make.
+    """
+    return {"settings": settings.as_dict(), "dataset": data_mark, "versions": versions()}
 
 
 def train_row(settings: PerformanceSettings, data: Dataset, place: Path) -> dict[str, Any]:
@@ -144,12 +149,13 @@ def main(
         # Parts that are started together find the data that the first of them collects.
         with rows.alone("data set"):
             data = open_or_collect(path, options.preset)
+        mark = fingerprint(data)
         every = trainings(options.preset)
         if not options.join:
             todo = [one for one in every if options.whole or smoke or first(one)]
             mine = part_of(matching(todo, options.only), options.shard)
-            _make(mine, rows, data, time_is_up(options))
-        found = {one.name: rows.read(one.name, made_with(one.settings, data)) for one in every}
+            _make(mine, rows, data, mark, time_is_up(options))
+        found = {one.name: rows.read(one.name, made_with(one.settings, mark)) for one in every}
         there = {key: row for key, row in found.items() if row is not None}
         write_result(name, options.preset, run(options.preset, data, there), folder)
         draw(folder)
@@ -160,7 +166,11 @@ def main(
 
 
 def _make(
-    todo: Sequence[Training], rows: RowFiles, data: Dataset, is_up: Callable[[], bool]
+    todo: Sequence[Training],
+    rows: RowFiles,
+    data: Dataset,
+    mark: str,
+    is_up: Callable[[], bool],
 ) -> None:
     """Makes the rows that are not there yet."""
     for number, one in enumerate(todo, 1):
@@ -169,5 +179,5 @@ def _make(
         settings, place = one.settings, rows.folder / ".models" / one.name
         say(f"{number} of {len(todo)}: {one.name}")
         rows.get(
-            one.name, made_with(settings, data), functools.partial(train_row, settings, data, place)
+            one.name, made_with(settings, mark), functools.partial(train_row, settings, data, place)
         )
