@@ -1,0 +1,229 @@
+"""Which gradient points where a planner gains: exact ones, smoothed ones, those of a model.
+
+The measure is the simulator's central difference over a planner's step: 0.2 m, 3 degrees, a tenth
+of an action's range. On random cycles of the data set's protocol, the cosine of each estimate with
+it, for action and pose apart.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import wlplan
+from experiments._common.cycles import Cycles, random_cycles
+from experiments._common.gradients import differences, jacobian
+from experiments._common.results import main
+from experiments._common.rows import Rows
+from wlplan import studies
+from wlplan.constants import CELL_SIZE, QUANTITIES
+from wlplan.io import write_bytes_atomic
+from wlplan.report.figures import png_bytes
+from wlplan.report.figures.style import BLUE, FAINT, GREEN, ORANGE, new_figure, tidy
+from wlplan.types import Pile, Pose, World, action_from
+
+SEED = 7
+ROLLOUTS, LOADS = 20, 10
+# Widths of the smoothing, in a planner's steps, and pairs of samples.
+WIDTHS, PAIRS = (0.1, 0.5), 16
+# A derivative of the simulator takes 0.7 s: first order is that of every eighth cycle, of half as
+# many pairs, and zeroth order is computed once more with as many.
+FIRST_EVERY, FIRST_WIDTH, FIRST_PAIRS = 8, 0.5, 8
+PARTS = {
+    "action": slice(3, 7),
+    "aside and turn": slice(1, 3),
+    "ahead": slice(0, 1),
+    "all": slice(0, 7),
+}
+MODELS = ("low", "hybrid")
+_RESAMPLED = 1000
+
+
+def run(preset: str, rows: Path) -> dict[str, Any]:
+    """Cosines of all estimates, by outcome and part."""
+    smoke = preset == "smoke"
+    cycles = random_cycles(1 if smoke else ROLLOUTS, 2 if smoke else LOADS, seed=SEED)
+    kept = Rows(rows, {"seed": SEED, "widths": WIDTHS, "pairs": (PAIRS, FIRST_PAIRS)})
+    estimates = _Estimates(cycles, exact=not smoke)
+    tables: list[dict[str, Any]] = [
+        kept.get(f"cycle {n}", lambda n=n: estimates(n)) for n in range(len(cycles.height))
+    ]
+    names = list(dict.fromkeys(name for table in tables for name in table["gradients"]))
+    names.remove("difference")
+    some = [n for n in range(len(tables)) if n % FIRST_EVERY == 0]
+    return {
+        "cycles": len(tables),
+        "steps": studies.STEPS,
+        "pairs": PAIRS,
+        "first_order": {"cycles": len(some), "width": FIRST_WIDTH, "pairs": FIRST_PAIRS},
+        "first_share": _shares([tables[n] for n in some]),
+        "estimates": {name: _agreement(name, tables) for name in names},
+        # Of the cycles that first order was computed of.
+        "on_some": {name: _agreement(name, [tables[n] for n in some]) for name in names},
+    }
+
+
+def yield_of(world: World, cycles: Cycles, number: int) -> studies.LoadingYield:
+    """Mass, time and work around a cycle."""
+    height, origin, vector = (jnp.asarray(part[number]) for part in cycles)
+    pile = Pile(height, CELL_SIZE, origin)
+    return studies.LoadingYield(world, pile, Pose(*vector[:3]), action_from(vector[3:]))
+
+
+class _Estimates:
+    """Makes the estimates of one cycle, each [3, 7] per step, with their processor time [s].
+
+    Args:
+        cycles: The cycles.
+        exact: Whether the simulator is differentiated, which takes minutes to compile.
+    """
+
+    def __init__(self, cycles: Cycles, *, exact: bool):
+        self.cycles, self.exact = cycles, exact
+        self.worlds = {name: wlplan.load_world(name) for name in (*MODELS, "simulator")}
+
+    def __call__(self, number: int) -> dict[str, Any]:
+        """All estimates of a cycle."""
+        simulated = yield_of(self.worlds["simulator"], self.cycles, number)
+        at = np.zeros(len(studies.COMPONENTS), np.float32)
+
+        def smoothed(order: str, width: float, pairs: int) -> studies.SmoothedGradient:
+            return studies.smoothed_gradient(
+                simulated, at, width=width, pairs=pairs, order=order, seed=number
+            )
+
+        ways: dict[str, Callable[[], Array]] = {"difference": lambda: differences(simulated)}
+        for name in MODELS:
+            model = yield_of(self.worlds[name], self.cycles, number)
+            ways[f"{name}, exact"] = lambda model=model: jacobian(model)
+        if self.exact:
+            ways["simulator, exact"] = lambda: jacobian(simulated)
+        for width in WIDTHS:
+            ways[f"zeroth order, width {width}"] = lambda width=width: (
+                smoothed("zeroth", width, PAIRS).gradient
+            )
+        gradients, seconds = {}, {}
+        for name, way in ways.items():
+            start = time.process_time()
+            gradients[name] = np.asarray(way(), float).round(7).tolist()
+            seconds[name] = time.process_time() - start
+        row: dict[str, Any] = {"gradients": gradients, "seconds": seconds}
+        if self.exact and number % FIRST_EVERY == 0:
+            start = time.process_time()
+            zeroth = smoothed("zeroth", FIRST_WIDTH, FIRST_PAIRS)
+            between = time.process_time()
+            first = jax.block_until_ready(smoothed("first", FIRST_WIDTH, FIRST_PAIRS))
+            end = time.process_time()
+            mixed = studies.mixed_order(zeroth, first)
+            few = {
+                f"zeroth order, width {FIRST_WIDTH}, {FIRST_PAIRS} pairs": zeroth,
+                "first order": first,
+                "mixed, by variance": studies.mixed_order(zeroth, first, bias=np.inf),
+                "mixed": mixed,
+            }
+            for name, one in few.items():
+                gradients[name] = np.asarray(one.gradient, float).round(7).tolist()
+            for name, took in zip(few, (between - start, end - between), strict=False):
+                seconds[name] = took
+            row["first_share"] = np.asarray(mixed.first_share, float).round(4).tolist()
+        return row
+
+
+def _shares(tables: list[dict[str, Any]]) -> dict[str, float]:
+    """Median weight of first order in the mixture, by outcome."""
+    shares = [table["first_share"] for table in tables if "first_share" in table]
+    if not shares:
+        return {}
+    return dict(zip(QUANTITIES, np.median(shares, axis=0).round(3).tolist(), strict=True))
+
+
+def _agreement(name: str, tables: list[dict[str, Any]]) -> dict[str, Any]:
+    """Cosines of an estimate with the differences, by outcome and part, and its median time [s]."""
+    having = [table for table in tables if name in table["gradients"]]
+    found, wanted = (
+        np.array([table["gradients"][which] for table in having]) for which in (name, "difference")
+    )
+    seconds = [table["seconds"][name] for table in having if name in table["seconds"]]
+    return {
+        "seconds": float(np.median(seconds)) if seconds else None,
+        **{
+            outcome: {
+                part: agreement(found[:, k, at], wanted[:, k, at]) for part, at in PARTS.items()
+            }
+            for k, outcome in enumerate(QUANTITIES)
+        },
+    }
+
+
+def agreement(
+    gradients: Float[np.ndarray, "n k"], differences: Float[np.ndarray, "n k"]
+) -> dict[str, Any]:
+    """Mean cosine with its interval of 90 %, and the share above 0.
+
+    A gradient that is zero points nowhere: its cosine counts as 0. Cycles without differences, in
+    which nothing is to be found, are left out.
+    """
+    sizes = np.linalg.norm(gradients, axis=1), np.linalg.norm(differences, axis=1)
+    some = sizes[1] > 0.0
+    products = (gradients * differences).sum(axis=1)[some]
+    cosines = products / np.maximum((sizes[0] * sizes[1])[some], 1e-300)
+    random = np.random.default_rng(SEED)
+    means = random.choice(cosines, (_RESAMPLED, len(cosines))).mean(axis=1)
+    return {
+        "cycles": int(some.sum()),
+        "mean": float(cosines.mean().round(4)),
+        "interval": np.percentile(means, [5.0, 95.0]).round(4).tolist(),
+        "median": float(np.median(cosines).round(4)),
+        "positive": float((cosines > 0.0).mean().round(4)),
+    }
+
+
+def draw(folder: Path) -> None:
+    """Mean cosines with their intervals, one panel an outcome and part."""
+    result = json.loads((folder / "smoothed_gradients.json").read_text())
+    parts = ("action", "aside and turn", "ahead")
+    colours = dict(zip(parts, (BLUE, ORANGE, GREEN), strict=True))
+    estimates = result["estimates"]
+    names = list(estimates)[::-1]
+    figure = new_figure(12.0, 0.9 + 0.42 * len(names))
+    panels = figure.subplots(1, len(QUANTITIES), sharey=True)
+    for panel, outcome in zip(panels, QUANTITIES, strict=True):
+        for shift, part in zip((0.22, 0.0, -0.22), parts, strict=True):
+            rows = [estimates[name][outcome][part] for name in names]
+            means = np.array([row["mean"] for row in rows])
+            low, high = np.array([row["interval"] for row in rows]).T
+            panel.errorbar(
+                means,
+                np.arange(len(names)) + shift,
+                xerr=[np.maximum(means - low, 0.0), np.maximum(high - means, 0.0)],
+                fmt="o",
+                ms=4,
+                color=colours[part],
+                label=part,
+            )
+        panel.axvline(0.0, color=FAINT, lw=0.8)
+        panel.set_xlim(-0.6, 1.05)
+        panel.set_title(outcome, fontsize=9)
+        panel.set_xlabel("mean cosine with the difference over a step", fontsize=8)
+        tidy(panel)
+    some = result["first_order"]["cycles"]
+    few = {name for name in names if estimates[name]["mass"]["all"]["cycles"] <= some}
+    panels[0].set_yticks(
+        np.arange(len(names)),
+        [f"{name} ({some} cycles)" if name in few else name for name in names],
+        fontsize=8,
+    )
+    panels[0].legend(fontsize=8, frameon=False, loc="lower left")
+    write_bytes_atomic(folder / "smoothed_gradients.png", png_bytes(figure, dpi=110))
+
+
+if __name__ == "__main__":
+    main("smoothed_gradients", run, draw)
