@@ -14,21 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 import wlplan
 from experiments._common.cycles import Cycles, random_cycles
-from experiments._common.gradients import differences, jacobian
+from experiments._common.gradients import PARTS, agreement, differences, jacobian, yield_of
 from experiments._common.results import main
 from experiments._common.rows import Rows
 from wlplan import studies
-from wlplan.constants import CELL_SIZE, QUANTITIES
+from wlplan.constants import QUANTITIES
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, GREEN, ORANGE, new_figure, tidy
-from wlplan.types import Pile, Pose, World, action_from
 
 SEED = 7
 ROLLOUTS, LOADS = 20, 10
@@ -37,14 +35,7 @@ WIDTHS, PAIRS = (0.1, 0.5), 16
 # A derivative of the simulator takes 0.7 s: first order is that of every eighth cycle, of half as
 # many pairs, and zeroth order is computed once more with as many.
 FIRST_EVERY, FIRST_WIDTH, FIRST_PAIRS = 8, 0.5, 8
-PARTS = {
-    "action": slice(3, 7),
-    "aside and turn": slice(1, 3),
-    "ahead": slice(0, 1),
-    "all": slice(0, 7),
-}
 MODELS = ("low", "hybrid")
-_RESAMPLED = 1000
 
 
 def run(preset: str, rows: Path) -> dict[str, Any]:
@@ -69,13 +60,6 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
         # Of the cycles that first order was computed of.
         "on_some": {name: _agreement(name, [tables[n] for n in some]) for name in names},
     }
-
-
-def yield_of(world: World, cycles: Cycles, number: int) -> studies.LoadingYield:
-    """Mass, time and work around a cycle."""
-    height, origin, vector = (jnp.asarray(part[number]) for part in cycles)
-    pile = Pile(height, CELL_SIZE, origin)
-    return studies.LoadingYield(world, pile, Pose(*vector[:3]), action_from(vector[3:]))
 
 
 class _Estimates:
@@ -160,29 +144,6 @@ def _agreement(name: str, tables: list[dict[str, Any]]) -> dict[str, Any]:
             }
             for k, outcome in enumerate(QUANTITIES)
         },
-    }
-
-
-def agreement(
-    gradients: Float[np.ndarray, "n k"], differences: Float[np.ndarray, "n k"]
-) -> dict[str, Any]:
-    """Mean cosine with its interval of 90 %, and the share above 0.
-
-    A gradient that is zero points nowhere: its cosine counts as 0. Cycles without differences, in
-    which nothing is to be found, are left out.
-    """
-    sizes = np.linalg.norm(gradients, axis=1), np.linalg.norm(differences, axis=1)
-    some = sizes[1] > 0.0
-    products = (gradients * differences).sum(axis=1)[some]
-    cosines = products / np.maximum((sizes[0] * sizes[1])[some], 1e-300)
-    random = np.random.default_rng(SEED)
-    means = random.choice(cosines, (_RESAMPLED, len(cosines))).mean(axis=1)
-    return {
-        "cycles": int(some.sum()),
-        "mean": float(cosines.mean().round(4)),
-        "interval": np.percentile(means, [5.0, 95.0]).round(4).tolist(),
-        "median": float(np.median(cosines).round(4)),
-        "positive": float((cosines > 0.0).mean().round(4)),
     }
 
 
