@@ -19,7 +19,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from experiments._common.cycles import random_cycles
-from experiments._common.gradients import PARTS, agreement, differences, jacobian, yield_of
+from experiments._common.gradients import PARTS, agreement, derivatives, differences, yield_of
 from experiments._common.models import load_pretrained
 from experiments._common.results import main
 from experiments._common.rows import Rows
@@ -43,7 +43,7 @@ from wlplan.types import Pile, Pose, action_vector
 
 SEED = 7
 ROLLOUTS, LOADS = 20, 10
-# Roughness and the simulator's derivatives are those of every fifth cycle.
+# Roughness is that of every fifth cycle.
 EVERY = 5
 # Widths in a planner's steps: 2 mm to 0.2 m aside, 0.03 to 3 degrees, 0.1 to 10 % of a range.
 WIDTHS = (0.01, 0.03, 0.1, 0.3, 1.0)
@@ -91,27 +91,25 @@ _PREDICTED = {
 def run(preset: str, rows: Path) -> dict[str, Any]:
     """Outcomes, agreement of derivatives, and roughness, by sampling."""
     smoke = preset == "smoke"
-    cycles = random_cycles(1 if smoke else ROLLOUTS, 2 if smoke else LOADS, seed=SEED)
+    with jax.enable_x64(True):
+        cycles = random_cycles(1 if smoke else ROLLOUTS, 2 if smoke else LOADS, seed=SEED)
     kept = Rows(rows, {"seed": SEED, "widths": WIDTHS, "every": EVERY})
     models = {kind: load_pretrained(kind)[0] for kind in MODELS}
 
     def row(number: int) -> dict[str, Any]:
         around = {name: yield_of(world, cycles, number) for name, world in SIMULATORS.items()}
         found: dict[str, Any] = {
-            f"simulator, {name}": _looked_at(
-                function, exact=number % EVERY == 0 and not smoke, rough=number % EVERY == 0
-            )
+            f"simulator, {name}": _looked_at(function, rough=number % EVERY == 0)
             for name, function in around.items()
         }
         for kind, model in models.items():
             for name, predicted in _PREDICTED.items():
                 function = Partial(predicted, model, around["bilinear"])
-                found[f"{kind}, {name}"] = _looked_at(
-                    function, exact=True, rough=number % EVERY == 0
-                )
+                found[f"{kind}, {name}"] = _looked_at(function, rough=number % EVERY == 0)
         return found
 
-    tables = [kept.get(f"cycle {n}", lambda n=n: row(n)) for n in range(len(cycles.height))]
+    with jax.enable_x64(True):
+        tables = [kept.get(f"cycle {n}", lambda n=n: row(n)) for n in range(len(cycles.height))]
     reference = [table["simulator, bilinear"] for table in tables]
     return {
         "cycles": len(tables),
@@ -124,26 +122,24 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
     }
 
 
-def _looked_at(function: Any, *, exact: bool, rough: bool) -> dict[str, Any]:
-    """A function around a cycle; its derivatives and its roughness if asked for."""
-    here = np.zeros(len(studies.COMPONENTS), np.float32)
-    found: dict[str, Any] = {
-        "value": _value(function, jnp.asarray(here)),
+def _looked_at(function: Any, *, rough: bool) -> dict[str, Any]:
+    """A function around a cycle: value, differences, derivatives, and roughness if asked for."""
+    here = np.zeros(len(studies.COMPONENTS))
+    tables = {
+        "value": _value(function, here),
         "difference": differences(function),
+        "gradient": derivatives(function),
     }
-    if exact:
-        found["gradient"] = jacobian(function)
-    found = {name: np.asarray(table, float).round(7).tolist() for name, table in found.items()}
+    found = {name: np.asarray(table).round(8).tolist() for name, table in tables.items()}
     if rough:
-        widths = np.asarray(WIDTHS, np.float32)
         for name, along in DIRECTIONS.items():
-            seen = studies.roughness(function, here, along.astype(np.float32), widths)
+            seen = studies.roughness(function, here, along, np.array(WIDTHS))
             found[f"rough, {name}"] = seen.share.round(6).tolist()
     return found
 
 
 @jax.jit
-def _value(function: Any, at: Array) -> Array:
+def _value(function: Any, at: Array | np.ndarray) -> Array:
     value: Array = function(at)
     return value
 
@@ -153,11 +149,10 @@ def _summary(tables: list[dict[str, Any]], reference: list[dict[str, Any]]) -> d
     value, usual = (np.array([row["value"] for row in rows]) for rows in (tables, reference))
     size = np.abs(usual).mean(axis=0)
     change = value - usual
-    having = [n for n, row in enumerate(tables) if "gradient" in row]
-    gradient = np.array([tables[n]["gradient"] for n in having])
     # With the differences of the same function, and with those of the simulator as it is.
-    itself, simulated = (
-        np.array([rows[n]["difference"] for n in having]) for rows in (tables, reference)
+    gradient, itself, simulated = (
+        np.array([row[which] for row in rows])
+        for which, rows in (("gradient", tables), ("difference", tables), ("difference", reference))
     )
     found: dict[str, Any] = {
         "against_the_simulator": {
@@ -180,14 +175,12 @@ def _summary(tables: list[dict[str, Any]], reference: list[dict[str, Any]]) -> d
         },
     }
     for title, wanted in (("own_differences", itself), ("simulator_differences", simulated)):
-        if having:
-            found[title] = {
-                outcome: {
-                    part: agreement(gradient[:, k, at], wanted[:, k, at])
-                    for part, at in PARTS.items()
-                }
-                for k, outcome in enumerate(QUANTITIES)
+        found[title] = {
+            outcome: {
+                part: agreement(gradient[:, k, at], wanted[:, k, at]) for part, at in PARTS.items()
             }
+            for k, outcome in enumerate(QUANTITIES)
+        }
     return found
 
 

@@ -15,11 +15,17 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
 
 import wlplan
 from experiments._common.cycles import Cycles, random_cycles
-from experiments._common.gradients import PARTS, agreement, differences, jacobian, yield_of
+from experiments._common.gradients import (
+    NARROW,
+    PARTS,
+    agreement,
+    derivatives,
+    differences,
+    yield_of,
+)
 from experiments._common.results import main
 from experiments._common.rows import Rows
 from wlplan import studies
@@ -27,26 +33,29 @@ from wlplan.constants import QUANTITIES
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, GREEN, ORANGE, new_figure, tidy
+from wlplan.types import World
 
 SEED = 7
 ROLLOUTS, LOADS = 20, 10
 # Widths of the smoothing, in a planner's steps, and pairs of samples.
 WIDTHS, PAIRS = (0.1, 0.5), 16
-# A derivative of the simulator takes 0.7 s: first order is that of every eighth cycle, of half as
-# many pairs, and zeroth order is computed once more with as many.
-FIRST_EVERY, FIRST_WIDTH, FIRST_PAIRS = 8, 0.5, 8
+# First order takes 14 times as many cycles: it is that of every fourth, from half as many pairs,
+# and zeroth order is computed once more with as many.
+FIRST_EVERY, FIRST_WIDTH, FIRST_PAIRS = 4, 0.5, 8
 MODELS = ("low", "hybrid")
 
 
 def run(preset: str, rows: Path) -> dict[str, Any]:
     """Cosines of all estimates, by outcome and part."""
     smoke = preset == "smoke"
-    cycles = random_cycles(1 if smoke else ROLLOUTS, 2 if smoke else LOADS, seed=SEED)
+    worlds = {name: wlplan.load_world(name) for name in (*MODELS, "simulator")}
     kept = Rows(rows, {"seed": SEED, "widths": WIDTHS, "pairs": (PAIRS, FIRST_PAIRS)})
-    estimates = _Estimates(cycles, exact=not smoke)
-    tables: list[dict[str, Any]] = [
-        kept.get(f"cycle {n}", lambda n=n: estimates(n)) for n in range(len(cycles.height))
-    ]
+    with jax.enable_x64(True):
+        cycles = random_cycles(1 if smoke else ROLLOUTS, 2 if smoke else LOADS, seed=SEED)
+        tables: list[dict[str, Any]] = [
+            kept.get(f"cycle {n}", lambda n=n: _estimates(worlds, cycles, n))
+            for n in range(len(cycles.height))
+        ]
     names = list(dict.fromkeys(name for table in tables for name in table["gradients"]))
     names.remove("difference")
     some = [n for n in range(len(tables)) if n % FIRST_EVERY == 0]
@@ -62,63 +71,46 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
     }
 
 
-class _Estimates:
-    """Makes the estimates of one cycle, each [3, 7] per step, with their processor time [s].
+def _estimates(worlds: dict[str, World], cycles: Cycles, number: int) -> dict[str, Any]:
+    """All estimates of one cycle, [3, 7] per step, with their processor time [s]."""
+    at = np.zeros(len(studies.COMPONENTS))
+    models = {name: yield_of(worlds[name], cycles, number) for name in MODELS}
+    simulated = studies.Differenced(yield_of(worlds["simulator"], cycles, number), NARROW)
 
-    Args:
-        cycles: The cycles.
-        exact: Whether the simulator is differentiated, which takes minutes to compile.
-    """
+    def smoothed(order: str, width: float, pairs: int) -> studies.SmoothedGradient:
+        return studies.smoothed_gradient(
+            simulated, at, width=width, pairs=pairs, order=order, seed=number
+        )
 
-    def __init__(self, cycles: Cycles, *, exact: bool):
-        self.cycles, self.exact = cycles, exact
-        self.worlds = {name: wlplan.load_world(name) for name in (*MODELS, "simulator")}
-
-    def __call__(self, number: int) -> dict[str, Any]:
-        """All estimates of a cycle."""
-        simulated = yield_of(self.worlds["simulator"], self.cycles, number)
-        at = np.zeros(len(studies.COMPONENTS), np.float32)
-
-        def smoothed(order: str, width: float, pairs: int) -> studies.SmoothedGradient:
-            return studies.smoothed_gradient(
-                simulated, at, width=width, pairs=pairs, order=order, seed=number
-            )
-
-        ways: dict[str, Callable[[], Array]] = {"difference": lambda: differences(simulated)}
-        for name in MODELS:
-            model = yield_of(self.worlds[name], self.cycles, number)
-            ways[f"{name}, exact"] = lambda model=model: jacobian(model)
-        if self.exact:
-            ways["simulator, exact"] = lambda: jacobian(simulated)
-        for width in WIDTHS:
-            ways[f"zeroth order, width {width}"] = lambda width=width: (
-                smoothed("zeroth", width, PAIRS).gradient
-            )
-        gradients, seconds = {}, {}
-        for name, way in ways.items():
-            start = time.process_time()
-            gradients[name] = np.asarray(way(), float).round(7).tolist()
-            seconds[name] = time.process_time() - start
-        row: dict[str, Any] = {"gradients": gradients, "seconds": seconds}
-        if self.exact and number % FIRST_EVERY == 0:
-            start = time.process_time()
-            zeroth = smoothed("zeroth", FIRST_WIDTH, FIRST_PAIRS)
-            between = time.process_time()
-            first = jax.block_until_ready(smoothed("first", FIRST_WIDTH, FIRST_PAIRS))
-            end = time.process_time()
-            mixed = studies.mixed_order(zeroth, first)
-            few = {
-                f"zeroth order, width {FIRST_WIDTH}, {FIRST_PAIRS} pairs": zeroth,
-                "first order": first,
-                "mixed, by variance": studies.mixed_order(zeroth, first, bias=np.inf),
-                "mixed": mixed,
-            }
-            for name, one in few.items():
-                gradients[name] = np.asarray(one.gradient, float).round(7).tolist()
-            for name, took in zip(few, (between - start, end - between), strict=False):
-                seconds[name] = took
-            row["first_share"] = np.asarray(mixed.first_share, float).round(4).tolist()
-        return row
+    ways: dict[str, Callable[[], Any]] = {
+        "difference": lambda: differences(simulated),
+        **{f"{name}, exact": lambda name=name: derivatives(models[name]) for name in MODELS},
+        "simulator, exact": lambda: derivatives(simulated),
+        **{
+            f"zeroth order, width {width}": lambda width=width: smoothed("zeroth", width, PAIRS)
+            for width in WIDTHS
+        },
+    }
+    few = f"zeroth order, width {FIRST_WIDTH}, {FIRST_PAIRS} pairs"
+    if number % FIRST_EVERY == 0:
+        ways[few] = lambda: smoothed("zeroth", FIRST_WIDTH, FIRST_PAIRS)
+        ways["first order"] = lambda: smoothed("first", FIRST_WIDTH, FIRST_PAIRS)
+    found, seconds = {}, {}
+    for name, way in ways.items():
+        start = time.process_time()
+        found[name] = jax.block_until_ready(way())
+        seconds[name] = time.process_time() - start
+    row: dict[str, Any] = {"seconds": seconds}
+    if few in found:
+        zeroth, first = found[few], found["first order"]
+        found["mixed, by variance"] = studies.mixed_order(zeroth, first, bias=np.inf)
+        found["mixed"] = studies.mixed_order(zeroth, first)
+        row["first_share"] = np.asarray(found["mixed"].first_share).round(4).tolist()
+    row["gradients"] = {
+        name: np.asarray(getattr(one, "gradient", one)).round(8).tolist()
+        for name, one in found.items()
+    }
+    return row
 
 
 def _shares(tables: list[dict[str, Any]]) -> dict[str, float]:

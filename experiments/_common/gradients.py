@@ -11,9 +11,8 @@ from jaxtyping import Array, Float
 
 from experiments._common.cycles import Cycles
 from wlplan.constants import CELL_SIZE
-from wlplan.studies import COMPONENTS, LoadingYield
+from wlplan.studies import COMPONENTS, Differenced, LoadingYield
 from wlplan.types import Pile, Pose, World, action_from
-from wlplan.worlds.capabilities import with_derivatives
 
 # The way ahead is apart: poses lie on the toe, so a planner does not move there by itself.
 PARTS = {
@@ -22,6 +21,8 @@ PARTS = {
     "ahead": slice(0, 1),
     "all": slice(0, 7),
 }
+# Half width of differences that stand for a derivative, in steps.
+NARROW = 1e-5
 # Resamplings of the cycles for an interval, and their seed.
 _RESAMPLED, _SEED = 1000, 7
 
@@ -36,16 +37,22 @@ def yield_of(world: World, cycles: Cycles, number: int) -> LoadingYield:
 @jax.jit
 def differences(function: Any) -> Float[Array, "k 7"]:
     """Central differences over one step of each component either way."""
-    away = jnp.eye(len(COMPONENTS))
-    ahead, behind = jnp.split(jax.vmap(function)(jnp.concatenate([away, -away])), 2)
-    return (0.5 * (ahead - behind)).T
+    return _differenced(function, 1.0)
 
 
 @jax.jit
-def jacobian(function: Any) -> Float[Array, "k 7"]:
-    """Derivatives by reverse mode."""
-    exact: Array = jax.jacrev(with_derivatives(function))(jnp.zeros(len(COMPONENTS)))
-    return exact
+def derivatives(function: Any) -> Float[Array, "k 7"]:
+    """Derivatives by narrow central differences.
+
+    In float64. `experiments.simulator_gradients` has them beside reverse mode.
+    """
+    return _differenced(function, NARROW)
+
+
+def _differenced(function: Any, width: float) -> Array:
+    here = jnp.zeros(len(COMPONENTS))
+    slopes: Array = Differenced(function, width).jacobian(here)
+    return slopes
 
 
 def agreement(

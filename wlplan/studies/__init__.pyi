@@ -17,6 +17,7 @@ from .smoothing import roughness as roughness
 from .smoothing import smoothed_gradient as smoothed_gradient
 from .variables import COMPONENTS as COMPONENTS
 from .variables import STEPS as STEPS
+from .variables import Differenced as Differenced
 from .variables import LoadingYield as LoadingYield
 from .variables import PlanCost as PlanCost
 from .variables import direction as direction
