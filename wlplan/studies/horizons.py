@@ -37,7 +37,7 @@ class Horizon(struct.PyTreeNode):
 
     loads: Int[Array, " h"]
     total: Float[Array, "h 4"]  # see `TOTALS`
-    gradient: Float[Array, "h 4 7"]  # by reverse mode
+    gradient: Float[Array, "h 4 7"]
     difference: Float[Array, "h 4 7"]  # half of that between a step forward and one back
 
 
@@ -47,6 +47,7 @@ def horizon(
     loads: Sequence[int],
     *,
     step: float = 1.0,
+    narrow: float | None = None,
     cusps: Cusps | None = None,
 ) -> Horizon:
     """Derivatives of totals with respect to pose and action of the first load.
@@ -58,6 +59,8 @@ def horizon(
         plan: N loadings, leaves (N,).
         loads: Numbers of loads to sum over, at most N.
         step: Half width of the differences, in steps.
+        narrow: Half width of differences that stand for the gradient, in float64: for worlds
+            without a derivative, and where 14 rollouts cost less. None: by reverse mode.
         cusps: Of the best ways to the receiver, leaves (N, ...), see
             `wlplan.planning.playing.cusps_of_plans`; None: ways are looked for each time.
 
@@ -68,31 +71,36 @@ def horizon(
     for number in loads:
         if not 1 <= number <= count:
             raise InputError(f"there are no {number} loads in a plan of {count}.")
-    found: Horizon = _horizon(job, plan, jnp.asarray(loads), jnp.asarray(step), cusps)
+    found: Horizon = _horizon(job, plan, jnp.asarray(loads), jnp.asarray(step), narrow, cusps)
     return found
 
 
 @jax.jit
-def _horizon(job: Job, plan: LoadingPlan, loads: Array, step: Array, cusps: Any) -> Horizon:
-    dtype = plan.pose.x.dtype
-    here = jnp.zeros(len(COMPONENTS), dtype)
+def _horizon(
+    job: Job, plan: LoadingPlan, loads: Array, step: Array, narrow: Array | None, cusps: Any
+) -> Horizon:
+    here = jnp.zeros(len(COMPONENTS), plan.pose.x.dtype)
+
+    def sums(steps: Array) -> Array:
+        return jnp.cumsum(_yields(job, plan, cusps, steps, loads.max()), axis=0)[loads - 1]
+
+    def differences(width: Array) -> Array:
+        away = width * jnp.eye(len(COMPONENTS), dtype=here.dtype)
+        # One after the other: avalanches side by side wait for the longest.
+        ahead, behind = jnp.split(lax.map(sums, jnp.concatenate([away, -away])), 2)
+        return jnp.moveaxis((ahead - behind) / (2.0 * width), 0, -1)
+
     slow = job.replace(world=with_derivatives(job.world))
 
-    def gradient(count: Array) -> Array:
+    def by_reverse_mode(count: Array) -> Array:
         def total(steps: Array) -> Array:
             return _yields(slow, plan, cusps, steps, count).sum(axis=0)
 
         jacobian: Array = jax.jacrev(total)(here)
         return jacobian
 
-    away = step * jnp.eye(len(COMPONENTS), dtype=dtype)
-    sums = lax.map(
-        lambda steps: jnp.cumsum(_yields(job, plan, cusps, steps, loads.max()), axis=0),
-        jnp.concatenate([here[None], away, -away]),
-    )[:, loads - 1]
-    base, ahead, behind = sums[0], sums[1 : 1 + len(away)], sums[1 + len(away) :]
-    difference = jnp.moveaxis((ahead - behind) / (2.0 * step), 0, -1)
-    return Horizon(loads, base, lax.map(gradient, loads), difference)
+    gradient = lax.map(by_reverse_mode, loads) if narrow is None else differences(narrow)
+    return Horizon(loads, sums(here), gradient, differences(step))
 
 
 def _yields(
