@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from wlplan.report.figures.style import BLUE, GREEN, INK, ORANGE, new_figure, ti
 from wlplan.types import LoadingPlan, Pile
 
 KIND, SLOPE_DEGREES, SEED = "conical", 30.0, 1
-PLANS, LOADS = 4, (1, 2, 5, 10, 20, 40)
+PLANS, LOADS = 2, (1, 2, 5, 10, 20, 40)
 WORLDS = {"low": BLUE, "hybrid": ORANGE, "high": GREEN, "simulator": INK}
 # A component whose difference is less than this part of the largest has no sign to speak of.
 _NOTHING = 0.02
@@ -42,12 +43,12 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
     kept = Rows(rows, {"pile": (KIND, SLOPE_DEGREES, SEED), "loads": loads})
     found: dict[str, list[Any]] = {name: [] for name in (("low",) if smoke else WORLDS)}
     for number in range(plans):
-        plan = kept.get(f"plan {number}", lambda n=number: _random_plan(pile, max(loads), n))
+        plan = np.array(kept.get(f"plan {number}", partial(_random_plan, pile, max(loads), number)))
         for name, tables in found.items():
             tables.append(
                 kept.get(
                     f"{name}, plan {number}",
-                    lambda name=name, plan=plan: _horizon(name, pile, np.array(plan), loads),
+                    partial(_horizon, name, pile, plan, loads),
                 )
             )
     return {

@@ -109,7 +109,9 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
         return found
 
     with jax.enable_x64(True):
-        tables = [kept.get(f"cycle {n}", lambda n=n: row(n)) for n in range(len(cycles.height))]
+        tables = [
+            kept.get(f"cycle {n}", functools.partial(row, n)) for n in range(len(cycles.height))
+        ]
     reference = [table["simulator, bilinear"] for table in tables]
     return {
         "cycles": len(tables),

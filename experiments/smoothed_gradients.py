@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
     with jax.enable_x64(True):
         cycles = random_cycles(1 if smoke else ROLLOUTS, 2 if smoke else LOADS, seed=SEED)
         tables: list[dict[str, Any]] = [
-            kept.get(f"cycle {n}", lambda n=n: _estimates(worlds, cycles, n))
+            kept.get(f"cycle {n}", partial(_estimates, worlds, cycles, n))
             for n in range(len(cycles.height))
         ]
     names = list(dict.fromkeys(name for table in tables for name in table["gradients"]))
@@ -83,18 +84,18 @@ def _estimates(worlds: dict[str, World], cycles: Cycles, number: int) -> dict[st
         )
 
     ways: dict[str, Callable[[], Any]] = {
-        "difference": lambda: differences(simulated),
-        **{f"{name}, exact": lambda name=name: derivatives(models[name]) for name in MODELS},
-        "simulator, exact": lambda: derivatives(simulated),
+        "difference": partial(differences, simulated),
+        **{f"{name}, exact": partial(derivatives, models[name]) for name in MODELS},
+        "simulator, exact": partial(derivatives, simulated),
         **{
-            f"zeroth order, width {width}": lambda width=width: smoothed("zeroth", width, PAIRS)
+            f"zeroth order, width {width}": partial(smoothed, "zeroth", width, PAIRS)
             for width in WIDTHS
         },
     }
     few = f"zeroth order, width {FIRST_WIDTH}, {FIRST_PAIRS} pairs"
     if number % FIRST_EVERY == 0:
-        ways[few] = lambda: smoothed("zeroth", FIRST_WIDTH, FIRST_PAIRS)
-        ways["first order"] = lambda: smoothed("first", FIRST_WIDTH, FIRST_PAIRS)
+        for name, order in ((few, "zeroth"), ("first order", "first")):
+            ways[name] = partial(smoothed, order, FIRST_WIDTH, FIRST_PAIRS)
     found, seconds = {}, {}
     for name, way in ways.items():
         start = time.process_time()

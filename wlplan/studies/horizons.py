@@ -123,9 +123,10 @@ def _yields(
             return Standing(after, done), jnp.stack(numbers)
 
         # A branch, not a mask: neither forward nor backward is anything computed beyond.
-        return lax.cond(
+        outcome: tuple[Standing, Array] = lax.cond(
             number < count, played, lambda same: (same, jnp.zeros(4, steps.dtype)), standing
         )
+        return outcome
 
     inputs = (jnp.arange(len(plan.pose.x)), plan, cusps)
     table: Array = load_by_load(load, beginning(job), inputs)[1]

@@ -105,7 +105,7 @@ def descent_path(
 
 @functools.partial(jax.jit, static_argnames="iterations")
 def _descent_path(
-    function: Function,
+    function: Any,
     at: Array,
     u: Array,
     v: Array,
@@ -114,7 +114,7 @@ def _descent_path(
     *,
     iterations: int,
 ) -> DescentPath:
-    differentiable: Any = with_derivatives(function)
+    differentiable = with_derivatives(function)
     evaluate = jax.value_and_grad(lambda place: differentiable(at + place[0] * u + place[1] * v))
     schedule = optax.cosine_decay_schedule(-1.0, iterations, alpha=0.05)
     optimiser = optax.chain(

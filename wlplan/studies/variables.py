@@ -54,7 +54,7 @@ def direction(name: str, *, load: int = 1, loads: int | None = None) -> Float[np
     """
     if name not in COMPONENTS:
         raise InputError(f"there is no component {name!r}: name one of {', '.join(COMPONENTS)}.")
-    one = np.eye(len(COMPONENTS))[COMPONENTS.index(name)]
+    one: np.ndarray = np.eye(len(COMPONENTS))[COMPONENTS.index(name)]
     if loads is None:
         return one
     if not 1 <= load <= loads:

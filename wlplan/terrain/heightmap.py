@@ -8,7 +8,7 @@ such kinks, costs more, and is there for who asks for it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -68,22 +68,26 @@ def sample_cubic(
     # The cell before [i, j] is [i + 1, j + 1] there.
     flat = jnp.pad(field, 2, mode="reflect", reflect_type="odd").reshape(-1)
     corner = (i + 1) * (ny + 4) + j + 1
-    along, across = _catmull_rom(u - i), _catmull_rom(v - j)
     rows = [
-        sum(weight * flat[corner + k * (ny + 4) + n] for n, weight in enumerate(across))
-        for k in range(4)
+        _catmull_rom([flat[corner + k * (ny + 4) + n] for n in range(4)], v - j) for k in range(4)
     ]
-    height: Array = sum(weight * row for weight, row in zip(along, rows, strict=True))
-    return height
+    return _catmull_rom(rows, u - i)
 
 
-def _catmull_rom(t: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], ...]:
-    """Weights of four points in a row at a part t of the way from the second to the third."""
-    return (
-        0.5 * t * (t * (2.0 - t) - 1.0),
-        0.5 * (t * t * (3.0 * t - 5.0) + 2.0),
-        0.5 * t * (t * (4.0 - 3.0 * t) + 1.0),
-        0.5 * t * t * (t - 1.0),
+def _catmull_rom(points: Sequence[Array], t: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The curve through four points in a row, a part t of the way from the second to the third."""
+    before, here, there, beyond = points
+    return here + 0.5 * t * (
+        there
+        - before
+        + t
+        * (
+            2.0 * before
+            - 5.0 * here
+            + 4.0 * there
+            - beyond
+            + t * (3.0 * (here - there) + beyond - before)
+        )
     )
 
 
