@@ -6,6 +6,7 @@ in the simulator.
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from pathlib import Path
@@ -83,7 +84,7 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
             return found
 
         planes[title] = {
-            name: kept.get(f"{title}, {name}", lambda n=name: of(n)) for name in worlds
+            name: kept.get(f"{title}, {name}", functools.partial(of, name)) for name in worlds
         }
     return {
         "pile": {"kind": KIND, "slope_degrees": SLOPE_DEGREES, "seed": SEED},

@@ -42,9 +42,9 @@ from wlplan.terrain.heightmap import (
 from wlplan.types import Pile, Pose, action_vector
 
 SEED = 7
-ROLLOUTS, LOADS = 20, 10
-# Roughness is that of every fifth cycle.
-EVERY = 5
+ROLLOUTS, LOADS = 10, 10
+# Roughness is that of every fifth cycle, by so many samples a width.
+EVERY, SAMPLES = 5, 10
 # Widths in a planner's steps: 2 mm to 0.2 m aside, 0.03 to 3 degrees, 0.1 to 10 % of a range.
 WIDTHS = (0.01, 0.03, 0.1, 0.3, 1.0)
 DIRECTIONS = {
@@ -93,7 +93,7 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
     smoke = preset == "smoke"
     with jax.enable_x64(True):
         cycles = random_cycles(1 if smoke else ROLLOUTS, 2 if smoke else LOADS, seed=SEED)
-    kept = Rows(rows, {"seed": SEED, "widths": WIDTHS, "every": EVERY})
+    kept = Rows(rows, {"seed": SEED, "widths": WIDTHS, "every": EVERY, "samples": SAMPLES})
     models = {kind: load_pretrained(kind)[0] for kind in MODELS}
 
     def row(number: int) -> dict[str, Any]:
@@ -135,7 +135,7 @@ def _looked_at(function: Any, *, rough: bool) -> dict[str, Any]:
     found = {name: np.asarray(table).round(8).tolist() for name, table in tables.items()}
     if rough:
         for name, along in DIRECTIONS.items():
-            seen = studies.roughness(function, here, along, np.array(WIDTHS))
+            seen = studies.roughness(function, here, along, np.array(WIDTHS), samples=SAMPLES)
             found[f"rough, {name}"] = seen.share.round(6).tolist()
     return found
 
