@@ -1,7 +1,7 @@
 """What a plan costs over two of its variables, and where the planners' descent goes there.
 
-Two neighbouring loads on a cone. The descent is made in the learned worlds; what it finds is played
-in the simulator.
+Two neighbouring loads on a cone. The descent is made in a learned world; what it finds is played in
+the simulator.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from wlplan.types import Action, LoadingPlan, Pose
 KIND, SLOPE_DEGREES, SEED = "conical", 30.0, 1
 # How far the second load lies along the toe, in its points of 0.1 m: half a bucket.
 APART = 12
-POINTS, REACH = 13, 4.0
-LEARNED, WORLDS = ("low", "hybrid"), ("low", "hybrid", "simulator")
+POINTS, REACH = 11, 4.0
+LEARNED, WORLDS = ("hybrid",), ("hybrid", "simulator")
 # Component and load of either axis.
 PLANES = {
     "where to dig": (("ahead", 1), ("aside", 1)),
@@ -39,14 +39,14 @@ PLANES = {
     "two loads": (("aside", 1), ("aside", 2)),
 }
 STARTS = np.array([[-3.0, -3.0], [3.0, -2.0], [-1.0, 3.0]])
-ITERATIONS = 32
+ITERATIONS = 24
 
 
 def run(preset: str, rows: Path) -> dict[str, Any]:
     """Landscapes of all worlds, paths of the learned ones."""
     smoke = preset == "smoke"
     points, iterations = (3, 2) if smoke else (POINTS, ITERATIONS)
-    worlds = ("low",) if smoke else WORLDS
+    worlds = LEARNED if smoke else WORLDS
     costs = _costs(worlds)
     kept = Rows(rows, {"points": points, "iterations": iterations, "starts": STARTS.tolist()})
     place = np.linspace(-REACH, REACH, points).astype(np.float32)

@@ -175,7 +175,8 @@ def draw(folder: Path) -> None:
         [f"{name} ({some} cycles)" if name in few else name for name in names],
         fontsize=8,
     )
-    panels[0].legend(fontsize=8, frameon=False, loc="lower left")
+    handles = panels[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     write_bytes_atomic(folder / "smoothed_gradients.png", png_bytes(figure, dpi=110))
 
 
