@@ -1,4 +1,4 @@
-"""What a plan costs over two of its variables, and where the planners' descent goes there.
+"""Seconds per tonne over two variables of a plan, and where the planners' descent goes there.
 
 Two neighbouring loads on a cone. The descent is made in a learned world; what it finds is played in
 the simulator.
@@ -10,22 +10,22 @@ import functools
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
 
 import wlplan
 from experiments._common.results import main
 from experiments._common.rows import Rows
 from wlplan import studies
 from wlplan.io import write_bytes_atomic
-from wlplan.planning.job import make_job
-from wlplan.planning.playing import cusps_of_plans
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import FAINT, new_figure
-from wlplan.types import Action, LoadingPlan, Pose
+from wlplan.types import Action, LoadingPlan, Pile, Pose, World
 
 KIND, SLOPE_DEGREES, SEED = "conical", 30.0, 1
 # How far the second load lies along the toe, in its points of 0.1 m: half a bucket.
@@ -38,8 +38,8 @@ PLANES = {
     "how to tilt": (("delta_bk", 1), ("k_bk", 1)),
     "two loads": (("aside", 1), ("aside", 2)),
 }
-STARTS = np.array([[-3.0, -3.0], [3.0, -2.0], [-1.0, 3.0]])
-ITERATIONS = 24
+STARTS = np.array([[-3.0, -3.0], [3.0, 2.0]])
+ITERATIONS = 20
 
 
 def run(preset: str, rows: Path) -> dict[str, Any]:
@@ -95,22 +95,32 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
     }
 
 
-def _costs(worlds: tuple[str, ...]) -> dict[str, studies.PlanCost]:
-    """The cost of two neighbouring loads with actions in the middle of their box."""
+@no_type_check
+class SecondsPerTonne(struct.PyTreeNode):
+    """Time over mass of a plan [s/tonne], driving apart, over the steps of its loads, [N, 7]."""
+
+    world: World
+    pile: Pile
+    plan: LoadingPlan
+
+    def __call__(self, steps: Float[Array, "n 7"]) -> Float[Array, ""]:
+        """What the plan so moved takes for a tonne."""
+        pose, action = studies.moved(self.plan.pose, self.plan.action, steps)
+        plan = self.plan.replace(pose=pose, action=action)
+        performance = wlplan.rollout(self.world, self.pile, plan).performance
+        return performance.time.sum() / performance.mass.sum()
+
+
+def _costs(worlds: tuple[str, ...]) -> dict[str, SecondsPerTonne]:
+    """Two neighbouring loads with actions in the middle of their box, in each world."""
     pile = wlplan.relax(wlplan.seed_pile(KIND, slope=math.radians(SLOPE_DEGREES), seed=SEED))
     toe = wlplan.toe_contour(pile)
     first = int(np.flatnonzero(toe.accessible)[0])
     spots = [first, first + APART]
     x, y = jnp.asarray(toe.points[spots].T, jnp.float32)
     middle = [jnp.full(2, value) for value in (0.35, 2.5, 0.35, 2.5)]
-    heading = jnp.asarray(toe.heading[spots], jnp.float32)
-    plan = LoadingPlan(Pose(x, y, heading), Action(*middle))
-    found = {}
-    for name in worlds:
-        job = make_job(wlplan.load_world(name), pile)
-        cusps = cusps_of_plans(job, jax.tree.map(lambda leaf: leaf[None], plan))
-        found[name] = studies.PlanCost(job, plan, jax.tree.map(lambda leaf: leaf[0], cusps))
-    return found
+    plan = LoadingPlan(Pose(x, y, jnp.asarray(toe.heading[spots], jnp.float32)), Action(*middle))
+    return {name: SecondsPerTonne(wlplan.load_world(name), pile, plan) for name in worlds}
 
 
 @jax.jit
@@ -144,7 +154,7 @@ def draw(folder: Path) -> None:
             panel.set_xlabel(f"{first}, load {load} [steps]", fontsize=8)
             panel.set_title(f"{title}: {name}", fontsize=9)
             panel.tick_params(colors=FAINT, labelsize=7)
-            figure.colorbar(image, ax=panel, pad=0.01)
+            figure.colorbar(image, ax=panel, pad=0.01, label="s/t")
         row[0].set_ylabel(f"{second}, load {other} [steps]", fontsize=8)
     write_bytes_atomic(folder / "cost_landscapes.png", png_bytes(figure, dpi=100))
 

@@ -149,6 +149,10 @@ def draw(folder: Path) -> None:
                     label=name,
                 )
             panel.set_xscale("log")
+            if what == "later":
+                # Linear up to a tenth: it begins at none.
+                panel.set_yscale("symlog", linthresh=0.1)
+                panel.set_ylim(bottom=0.0)
             panel.set_xticks(result["loads"], [str(n) for n in result["loads"]])
             panel.minorticks_off()
             tidy(panel)

@@ -168,7 +168,7 @@ class Differenced(struct.PyTreeNode):
         away = self.width * jnp.eye(variables.size, dtype=variables.dtype)
         away = away.reshape(-1, *variables.shape)
         ahead, behind = jnp.split(
-            values_at(self.function, variables + jnp.concatenate([away, -away])), 2
+            values_at(self.function, variables[None] + jnp.concatenate([away, -away])), 2
         )
         slopes = jnp.moveaxis((ahead - behind) / (2.0 * self.width), 0, -1)
         return slopes.reshape(*slopes.shape[:-1], *variables.shape)
