@@ -153,11 +153,13 @@ def test_differences_stand_for_derivatives() -> None:
     """So the studies pass a function that has none."""
     matrix = np.random.default_rng(0).normal(size=(2, 2, 3))
 
+    def multiply(x: Any) -> np.ndarray:
+        product: np.ndarray = np.einsum("kij,...ij->...k", matrix, np.asarray(x))
+        return product
+
     def linear(x: jax.Array) -> jax.Array:
         shape = jax.ShapeDtypeStruct((2,), x.dtype)
-        found: jax.Array = jax.pure_callback(
-            lambda x: np.einsum("kij,...ij->...k", matrix, x), shape, x, vmap_method="expand_dims"
-        )
+        found: jax.Array = jax.pure_callback(multiply, shape, x, vmap_method="expand_dims")
         return found
 
     with jax.enable_x64(True):

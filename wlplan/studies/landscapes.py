@@ -114,7 +114,7 @@ def _descent_path(
     *,
     iterations: int,
 ) -> DescentPath:
-    differentiable = with_derivatives(function)
+    differentiable: Any = with_derivatives(function)
     evaluate = jax.value_and_grad(lambda place: differentiable(at + place[0] * u + place[1] * v))
     schedule = optax.cosine_decay_schedule(-1.0, iterations, alpha=0.05)
     optimiser = optax.chain(

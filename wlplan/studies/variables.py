@@ -159,6 +159,9 @@ class Differenced(struct.PyTreeNode):
     function: Function
     width: Float[Array, ""] | float = 1e-5  # half of that of a difference
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "function", as_function(self.function))
+
     def __call__(self, variables: Float[Array, "*d"]) -> Float[Array, "*k"]:
         """The function itself."""
         return self.function(variables)
