@@ -200,7 +200,7 @@ def roughness(
     Pure, and compiled once for each kind of function and number of widths and samples.
 
     Args:
-        function: Of an array [*d] to an array [*k].
+        function: Of an array to an array.
         at: Where.
         along: Direction; a width of 1 has its length.
         widths: Standard deviations of the samples.
