@@ -48,7 +48,7 @@ def landscape(
     Pure, and compiled once for each kind of function.
 
     Args:
-        function: Of an array [*d] to an array [*k].
+        function: Of an array to an array.
         at: Where both coordinates are 0.
         directions: What a unit of either coordinate does, for instance two of
             `wlplan.studies.direction`.
@@ -84,7 +84,7 @@ def descent_path(
     Adam with the planners' momentum, whose steps become shorter by a cosine.
 
     Args:
-        function: Of an array [*d] to one number, what is to become less.
+        function: Of an array to one number, what is to become less.
         at: As of `landscape`.
         directions: As of `landscape`.
         starts: Coordinates that rows begin at.

@@ -33,7 +33,7 @@ def line(
     Pure, and compiled once for each kind of function. Reverse mode takes place after place.
 
     Args:
-        function: Of an array [*d] to an array [*k].
+        function: Of an array to an array.
         at: Where place 0 is.
         along: Where to, in one unit of the place: a direction, or the other end of the line less
             this one.

@@ -55,7 +55,7 @@ def smoothed_gradient(
     Pure, and compiled once for each kind of function. In a quadratic function all orders are exact.
 
     Args:
-        function: Of an array [d] to an array [*k].
+        function: Of an array [d] to an array.
         at: Where.
         width: Standard deviation of the samples, the same for all variables.
         pairs: Of samples. Zeroth order evaluates both, first order differentiates at both, mixed

@@ -167,7 +167,7 @@ class Differenced(struct.PyTreeNode):
         return self.function(variables)
 
     def jacobian(self, variables: Float[Array, "*d"]) -> Float[Array, "..."]:
-        """Its derivatives [*k, *d]."""
+        """Its derivatives: the axes of the outcome, then those of the variables."""
         away = self.width * jnp.eye(variables.size, dtype=variables.dtype)
         away = away.reshape(-1, *variables.shape)
         ahead, behind = jnp.split(
