@@ -54,7 +54,7 @@ from wlplan.report import diggability_page, making, pictures
 from wlplan.report import figures as plots
 from wlplan.report.document import plan_document
 from wlplan.studies import diggability as studies
-from wlplan.studies.diggability import DiggabilityMap
+from wlplan.studies.diggability import DiggabilityMap, Foreseen
 from wlplan.studies.gradcheck import Component, GradientCheck
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
@@ -385,7 +385,7 @@ def test_diggability_writes_all_or_nothing(
     values = np.arange(1.0, 4.0)
     found = DiggabilityMap(poses, Performance(values, values, values))
     monkeypatch.setattr(studies, "diggability_map", lambda *_, **__: found)
-    monkeypatch.setattr(studies, "stalls_on_map", lambda *_: None)
+    monkeypatch.setattr(studies, "foreseen_on_map", lambda *_: Foreseen(None, None))
     monkeypatch.setattr(diggability_page, "render_map", lambda *_, **__: f"<p>{MADE_BY}</p>")
     out = old_files(folder / "out", "report.html", "diggability.json")
     run = command("diggability", scan, "--locations", 3, "--out", out, "--json")

@@ -36,8 +36,8 @@ for n in itertools.count():
 COLLECTOR = """
 import sys
 from wlplan import cli
-from wlplan.dataset import collecting, layout, protocol, store, worker_pool
-for part in (layout, protocol, worker_pool, collecting, store):
+from wlplan.dataset import collecting, layout, episode, store, worker_pool
+for part in (layout, episode, worker_pool, collecting, store):
     part.LOADS = 3
 layout._BATCH = 2
 store.command = lambda: "wlplan collect"

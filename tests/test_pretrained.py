@@ -187,7 +187,7 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(
     )
     monkeypatch.setattr(weights, "collect", collect)
     monkeypatch.setattr(weights, "open_dataset", lambda path: few)
-    monkeypatch.setattr(weights, "is_new", lambda path: len(collected) < 5)
+    monkeypatch.setattr(weights, "is_new", lambda path: len(collected) < 6)
     monkeypatch.setattr(weights, "read_attributes", lambda path: {"cycles": 1, "cycles_done": 1})
 
     def train(
