@@ -387,6 +387,7 @@ def test_diggability_writes_all_or_nothing(
     monkeypatch.setattr(studies, "diggability_map", lambda *_, **__: found)
     monkeypatch.setattr(studies, "foreseen_on_map", lambda *_: Foreseen(None, None))
     monkeypatch.setattr(diggability_page, "render_map", lambda *_, **__: f"<p>{MADE_BY}</p>")
+    monkeypatch.setattr(diggability_page, "map_figure", lambda *_, **__: None)
     out = old_files(folder / "out", "report.html", "diggability.json")
     run = command("diggability", scan, "--locations", 3, "--out", out, "--json")
     check_all_or_nothing(folder, kind, run)
