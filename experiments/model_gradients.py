@@ -18,6 +18,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from experiments._common.cycles import Cycles
+from experiments._common.gradients import cosines
 from experiments._common.models import (
     PREDICTORS,
     PRETRAINED,
@@ -178,22 +179,15 @@ def _agreement(
 def summary(
     gradients: Float[np.ndarray, "n k"], differences: Float[np.ndarray, "n k"]
 ) -> dict[str, Any]:
-    """Median and 10th percentile of the cosines, and the share of those above 0.
-
-    A gradient that is zero points nowhere: its cosine counts as 0. Cycles without differences, in
-    which nothing is to be found, are left out.
-    """
-    sizes = np.linalg.norm(gradients, axis=1), np.linalg.norm(differences, axis=1)
-    some = sizes[1] > 0.0
-    products = (gradients * differences).sum(axis=1)[some]
-    cosines = products / np.maximum((sizes[0] * sizes[1])[some], 1e-300)
-    low, middle = np.percentile(cosines, [10.0, 50.0])
+    """Median and 10th percentile of the cosines, and the share of those above 0, see `cosines`."""
+    found, lengths = cosines(gradients, differences)
+    low, middle = np.percentile(found, [10.0, 50.0])
     return {
-        "cycles": int(some.sum()),
+        "cycles": len(found),
         "median": float(middle),
         "p10": float(low),
-        "positive": float((cosines > 0.0).mean()),
-        "median_length_ratio": float(np.median(sizes[0][some] / sizes[1][some])),
+        "positive": float((found > 0.0).mean()),
+        "median_length_ratio": float(np.median(lengths)),
     }
 
 

@@ -1,15 +1,18 @@
-"""Prints what is installed for wlplan, by extra: version and licence of each package.
+"""Prints what is installed for wlplan, by extra, and what of it is unsafe: `make audit`.
 
-    python tests/dependencies.py     `make audit` does it too
-
-It asks the packages that are installed, and nobody else. A package stands at the first extra that
-needs it.
+Version and licence are what the packages say that are installed. A package stands at the first
+extra that needs it. What is unsafe pip-audit asks a database; without a network, a line says so.
 """
 
 from __future__ import annotations
 
+import json
 import re
+import subprocess
+import sys
+import sysconfig
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from packaging.requirements import Requirement
@@ -60,8 +63,32 @@ def closure(roots: list[Requirement], known: set[str]) -> tuple[list[str], list[
     return sorted(found), sorted(lacking)
 
 
-def main() -> None:
-    """Prints all of them."""
+def unsafe() -> int:
+    """Prints what is known to be unsafe; returns 1 if something is, 0 also if nobody can say."""
+    words = ["--quiet", "pip-audit", "--progress-spinner", "off", "--skip-editable"]
+    words += ["--format", "json", "--path", sysconfig.get_path("purelib")]
+    uvx = Path(sys.executable).with_name("uvx")
+    try:
+        asked = subprocess.run([uvx, *words], capture_output=True, text=True, check=False)
+        known = json.loads(asked.stdout)["dependencies"]
+    except (OSError, ValueError, KeyError):
+        print("\npip-audit could not be run: no network, or no uvx beside this Python")
+        return 0
+    # What it cannot look up counts as safe to it.
+    skipped = [one["name"] for one in known if "skip_reason" in one and one["name"] != "wlplan"]
+    print(f"\nknown to be unsafe, of {len(known) - len(skipped)} packages that could be looked up:")
+    found = [(one["name"], fault["id"]) for one in known for fault in one.get("vulns", ())]
+    for name, fault in found:
+        print(f"  {name:32} {fault}")
+    if not found:
+        print("  none")
+    if skipped:
+        print(f"  {len(skipped)} could not be looked up: {', '.join(skipped)}")
+    return bool(found)
+
+
+def main() -> int:
+    """Prints all of them; returns 1 if one is known to be unsafe."""
     known = {"wlplan"}
     extras = metadata.metadata("wlplan").get_all("Provides-Extra") or []
     for extra in ("", *extras):
@@ -75,7 +102,8 @@ def main() -> None:
             print(f"  {name:32} {metadata.version(name):16} {licence(name)}{apart}")
         if lacking:
             print(f"  not installed: {', '.join(lacking)}")
+    return unsafe()
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

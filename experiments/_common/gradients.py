@@ -55,10 +55,10 @@ def _differenced(function: Any, width: float) -> Array:
     return slopes
 
 
-def agreement(
+def cosines(
     gradients: Float[np.ndarray, "n k"], differences: Float[np.ndarray, "n k"]
-) -> dict[str, Any]:
-    """Mean cosine with its interval of 90 %, and the share above 0.
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Cosines between gradients and differences, and how many times as long the gradients are.
 
     A gradient that is zero points nowhere: its cosine counts as 0. Cycles without differences, in
     which nothing is to be found, are left out.
@@ -66,13 +66,21 @@ def agreement(
     sizes = np.linalg.norm(gradients, axis=1), np.linalg.norm(differences, axis=1)
     some = sizes[1] > 0.0
     products = (gradients * differences).sum(axis=1)[some]
-    cosines = products / np.maximum((sizes[0] * sizes[1])[some], 1e-300)
+    of_angles = products / np.maximum((sizes[0] * sizes[1])[some], 1e-300)
+    return of_angles, sizes[0][some] / sizes[1][some]
+
+
+def agreement(
+    gradients: Float[np.ndarray, "n k"], differences: Float[np.ndarray, "n k"]
+) -> dict[str, Any]:
+    """Mean cosine with its interval of 90 %, and the share above 0, see `cosines`."""
+    found, _ = cosines(gradients, differences)
     random = np.random.default_rng(_SEED)
-    means = random.choice(cosines, (_RESAMPLED, len(cosines))).mean(axis=1)
+    means = random.choice(found, (_RESAMPLED, len(found))).mean(axis=1)
     return {
-        "cycles": int(some.sum()),
-        "mean": float(cosines.mean().round(4)),
+        "cycles": len(found),
+        "mean": float(found.mean().round(4)),
         "interval": np.percentile(means, [5.0, 95.0]).round(4).tolist(),
-        "median": float(np.median(cosines).round(4)),
-        "positive": float((cosines > 0.0).mean().round(4)),
+        "median": float(np.median(found).round(4)),
+        "positive": float((found > 0.0).mean().round(4)),
     }

@@ -83,15 +83,30 @@ def write_result(
     return path
 
 
-def open_or_collect(path: Path, preset: str) -> Dataset:
-    """The data set at a path; if it is missing or not finished, it is collected first.
+def add_data(parser: argparse.ArgumentParser) -> None:
+    """The option that names the data set, for `data_of`."""
+    parser.add_argument(
+        "--data",
+        type=Path,
+        help=f"data set; collected if it is not there (default {DATA}, for smoke a new one)",
+    )
+
+
+def data_of(options: argparse.Namespace, folder: Path) -> Dataset:
+    """The data set that the options name; if it is missing or not finished, it is collected first.
+
+    Args:
+        options: Of `add_data` and `add_places`.
+        folder: Of results, where a short run has its own.
 
     Raises:
         InputError: If there is something else, or a part of a collection of other settings.
     """
+    smoke = options.preset == "smoke"
+    path = options.data or (folder / DATA.name if smoke else DATA)
     with contextlib.suppress(InputError):
         return open_dataset(path)
-    count = SMOKE_CYCLES if preset == "smoke" else CYCLES
+    count = SMOKE_CYCLES if smoke else CYCLES
     say(f"collecting {count} cycles in {path}")
     collect(path, cycles=count)
     return open_dataset(path)
@@ -121,11 +136,7 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
     parser = argparse.ArgumentParser(prog=f"python -m experiments.{name}")
     add_places(parser)
     if "data" in needs:
-        parser.add_argument(
-            "--data",
-            type=Path,
-            help=f"data set; collected if it is not there (default {DATA}, for smoke a new one)",
-        )
+        add_data(parser)
     if "models" in needs:
         parser.add_argument(
             "--models",
@@ -165,8 +176,7 @@ def _run(
     if "models" in needs:
         more["models"] = options.models or (folder / MODELS.name if smoke else MODELS)
     if "data" in needs:
-        path = options.data or (folder / DATA.name if smoke else DATA)
-        more["data"] = open_or_collect(path, options.preset)
+        more["data"] = data_of(options, folder)
     start = time.perf_counter()
     result = run(options.preset, **more)
     write_result(name, options.preset, result, folder, seconds=time.perf_counter() - start)

@@ -15,7 +15,7 @@ import numpy as np
 from flax import nnx
 
 from experiments._common.places import add_places, folder_of, say
-from experiments._common.results import DATA, open_or_collect, redraw, write_result
+from experiments._common.results import add_data, data_of, redraw, write_result
 from experiments._common.row_files import (
     RowFiles,
     add_row_options,
@@ -127,11 +127,7 @@ def main(
     """
     parser = argparse.ArgumentParser(prog=f"python -m experiments.{name}")
     add_places(parser)
-    parser.add_argument(
-        "--data",
-        type=Path,
-        help=f"data set; collected if it is not there (default {DATA}, for smoke a new one)",
-    )
+    add_data(parser)
     add_row_options(parser, Path("out") / name)
     parser.add_argument(
         "--whole", action="store_true", help="make all rows, and not only those that come first"
@@ -145,10 +141,9 @@ def main(
         smoke = options.preset == "smoke"
         rows = RowFiles(options.rows or (folder / name if smoke else Path("out") / name))
         say(f"{name}: rows in {rows.folder}; the result goes to {folder}")
-        path = options.data or (folder / DATA.name if smoke else DATA)
         # Parts that are started together find the data that the first of them collects.
         with rows.alone("data set"):
-            data = open_or_collect(path, options.preset)
+            data = data_of(options, folder)
         mark = fingerprint(data)
         every = trainings(options.preset)
         if not options.join:

@@ -55,7 +55,7 @@ class Ensemble(struct.PyTreeNode, eq=False):
         return self.members.faces_seen
 
     def __call__(self, local: LocalHeightmap, action: Float[Array, "4"]) -> Performance:
-        """Mean of the performance that the members predict, and of its error in sums.
+        """Mean of the performance that the members predict, with the bias that sums need.
 
         Args:
             local: Local heightmap of 36 × 36 cells.
