@@ -73,9 +73,9 @@ def _read(path: Path) -> Experiment | None:
         return None
     words = ast.get_docstring(module) or ""
     shows = _SHOWS.search(" ".join(words.split()))
-    return Experiment(
-        path.stem, words.partition("\n")[0], shows[1] if shows else "", _constant(module, "ENGINE")
-    )
+    # "table 1 and section 6" shows the table.
+    paper = shows[1].strip().removesuffix(" and") if shows else ""
+    return Experiment(path.stem, words.partition("\n")[0], paper, _constant(module, "ENGINE"))
 
 
 def _constant(module: ast.Module, name: str) -> tuple[str, ...]:
