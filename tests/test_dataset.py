@@ -661,7 +661,7 @@ def test_a_lock_that_is_not_signed_yet_is_left_alone(copy: Path) -> None:
     assert lock.exists()
 
 
-@pytest.mark.parametrize("holder", ["", "99999999 1 {host}", "{pid} 1 {host}"])
+@pytest.mark.parametrize("holder", ["", "99999999 12", "99999999 1 {host}", "{pid} 1 {host}"])
 def test_the_lock_of_a_dead_process_is_taken_over(copy: Path, holder: str) -> None:
     lock = copy.with_name("copy.zarr.lock")
     lock.write_text(holder.format(pid=os.getpid(), host=socket.gethostname()))

@@ -169,7 +169,9 @@ def test_many_broken_files_end_so_in_little_memory(name: str) -> None:
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=1200
     )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
+    # libtiff has a line of its own for a seek that fails, which nothing turns off.
+    said = [line for line in done.stderr.splitlines() if not line.startswith("_tiffSeekProc: ")]
+    assert (done.returncode, done.stdout, said) == (0, "True\n", [])
 
 
 def limited() -> None:
