@@ -1,7 +1,5 @@
 """The planners: a file each, named after its planner; one line each here for type checkers."""
 
-from typing import Any
-
 from wlplan.planning.proposals import Planner
 
 from .cma_es import CmaEs as CmaEs
@@ -17,4 +15,4 @@ from .tree_search import TreeSearch as TreeSearch
 NAMES: tuple[str, ...]
 
 def class_name(name: str) -> str: ...
-def checked(value: Any) -> Planner: ...
+def checked(value: object) -> Planner: ...
