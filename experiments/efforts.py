@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import wlplan
+from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.amounts import Loads
@@ -47,7 +48,7 @@ def run(preset: str) -> dict[str, Any]:
     one = next(row["milliseconds"] for row in rows if row["kind"] == "loading")
     for row in rows:
         row["measured"] = row["milliseconds"] / one
-        print(json.dumps(row), flush=True)
+        say(json.dumps(row))
     return {"world": "hybrid", "pile": "cone", "loads": loads, "plans": plans, "rows": rows}
 
 

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 
 from experiments._common.models import (
     PREDICTORS,
@@ -28,6 +30,7 @@ from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, FAINT, INK, ORANGE, new_figure, tidy
+from wlplan.report.figures.surface import DIFFERENCE, FROM_BEHIND, draw_surface
 from wlplan.site.machine import WA320
 from wlplan.training.evaluation import predict
 
@@ -150,7 +153,7 @@ def _skew(data: Dataset, worst: np.ndarray) -> dict[str, float]:
 
 
 def draw(folder: Path) -> None:
-    """Figure 9 as error_distribution.png, figure 10 as worst_predictions.png."""
+    """Figure 9 as error_distribution.png, figure 10 as worst_predictions.png and ..._aside.png."""
     result = json.loads((folder / "error_distribution.json").read_text())
     figure = new_figure(10.5, 3.1)
     colours = dict(zip(result["error"], (BLUE, ORANGE), strict=True))
@@ -184,6 +187,7 @@ def draw(folder: Path) -> None:
     figure.suptitle(f"{result['cycles']} held-out cycles; {note}", fontsize=8, color=FAINT)
     write_bytes_atomic(folder / "error_distribution.png", png_bytes(figure))
     _draw_worst(result, folder)
+    _draw_worst_aside(result, folder)
 
 
 def _draw_worst(result: dict[str, Any], folder: Path) -> None:
@@ -235,6 +239,42 @@ def _draw_worst(result: dict[str, Any], folder: Path) -> None:
         color=FAINT,
     )
     write_bytes_atomic(folder / "worst_predictions.png", png_bytes(figure))
+
+
+def _draw_worst_aside(result: dict[str, Any], folder: Path) -> None:
+    """The ten worst predictions: the pile before, in the colours of what the loading changes."""
+    figure = new_figure(11.0, 4.2)
+    panels = figure.subplots(2, 5, sharex=True, sharey=True, gridspec_kw={"wspace": 0.02}).ravel()
+    low, high = MODELS
+    norm = Normalize(-CHANGE, CHANGE)
+    for panel, item in zip(panels, result["worst"], strict=False):
+        # The heights that are kept are those of every other cell.
+        change, height = (0.01 * np.array(item[name]) for name in ("change_cm", "height_cm"))
+        draw_surface(
+            panel,
+            height,
+            2.0 * CELL_SIZE,
+            DIFFERENCE,
+            norm,
+            values=change[::2, ::2],
+            base=float(height.min()) - 0.2,
+            view=FROM_BEHIND,
+        )
+        errors = [100.0 * item["error"][title] for title in (low, high)]
+        said = f"{item['mass']:.2f} t; ψ_low {errors[0]:+.0f} %, ψ_high {errors[1]:+.0f} %"
+        panel.set_title(said, fontsize=7.5, color=INK)
+    bar = figure.colorbar(
+        ScalarMappable(norm, DIFFERENCE), ax=panels.tolist(), shrink=0.6, pad=0.01
+    )
+    bar.set_label("change by the loading [m]", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+    figure.suptitle(
+        "The same piles before the loading, which goes to the right and back",
+        fontsize=8,
+        color=FAINT,
+    )
+    content = png_bytes(figure, dpi=120, rare_colours=True)
+    write_bytes_atomic(folder / "worst_predictions_aside.png", content)
 
 
 if __name__ == "__main__":

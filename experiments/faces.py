@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 import wlplan
+from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.io import bundled_pile_path, write_bytes_atomic
 from wlplan.planning.objectives import OBJECTIVES
@@ -102,7 +103,7 @@ def run(preset: str) -> dict[str, Any]:
                 row: dict[str, Any] = {"pile": name, "loads": loads, "objective": asked}
                 row["foreseen_not_clear"] = int((foreseen[:loads] < -TOUCHES).sum())
                 rows.append({**row, **_summary(played, clear, loads)})
-                print(json.dumps(rows[-1]), flush=True)
+                say(json.dumps(rows[-1]))
     return {"rows": rows}
 
 

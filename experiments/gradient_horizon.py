@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import wlplan
+from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.io import write_bytes_atomic
@@ -84,7 +85,8 @@ def _row(job: Job, plan: LoadingPlan, loads: int) -> dict[str, Any]:
         "last": np.linalg.norm(table[:, -1], axis=-1),
         "all": np.linalg.norm(table, axis=(-2, -1)),
     }
-    print(loads, {name: f"{np.median(values):.4f}" for name, values in norms.items()}, flush=True)
+    medians = {name: round(float(np.median(values)), 4) for name, values in norms.items()}
+    say(f"{loads} loads: {json.dumps(medians)}")
     return {
         "horizon": loads,
         "cost_per_load": float(np.median(costs)) / loads,

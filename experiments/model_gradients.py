@@ -1,23 +1,24 @@
 """Gradients of the performance predictors: along a line of actions, and against the simulator's.
 
-The line is that of the paper's appendix C. The other comparison tells whether a gradient planner
-goes the right way: on random cycles of the data set's protocol, the angle between the gradient of a
-model in pose and action and central differences of the simulator.
+Paper, figure 19, is the line. The other comparison tells whether a gradient planner goes the right
+way: on random cycles of the data set's protocol, the angle between the gradient of a model in pose
+and action and central differences of the simulator.
 """
 
 from __future__ import annotations
 
 import json
-import sys
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
+from experiments._common.cycles import Cycles
+from experiments._common.gradients import cosines
 from experiments._common.models import (
     PREDICTORS,
     PRETRAINED,
@@ -25,6 +26,7 @@ from experiments._common.models import (
     load_pretrained,
     smoke_settings,
 )
+from experiments._common.places import say
 from experiments._common.results import dataset_summary, main
 from experiments.simulator_gradients import (
     LINE,
@@ -37,10 +39,11 @@ from experiments.simulator_gradients import (
     SCALE,
     SEED,
     UNITS,
-    random_cases,
+    in_float64,
     replayed,
     site_of_the_line,
 )
+from wlplan import studies
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
 from wlplan.io import write_bytes_atomic
@@ -79,7 +82,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     }
     chosen |= {title: load_pretrained(kind)[0] for title, kind in PRETRAINED.items()}
     with jax.enable_x64(True):
-        cases = random_cases(1 if smoke else ROLLOUTS, 2 if smoke else LOADS)
+        cases = in_float64(1 if smoke else ROLLOUTS, 2 if smoke else LOADS)
         differences = _differences(cases)
         rows = {
             title: _agreement(_jacobians(model, cases), differences)
@@ -93,7 +96,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
         }
         return {
             "data": dataset_summary(data),
-            "cycles": len(cases[0]),
+            "cycles": len(cases.height),
             "step_units": UNITS.tolist(),
             "steps": STEPS,
             "models": rows,
@@ -115,23 +118,18 @@ def _outcome(
 
 
 @jax.jit
-def _value_and_jacobian(
-    model: Any, height: Array, origin: Array, vector: Array
-) -> tuple[Array, Array]:
-    """Outcomes [3] and their derivatives [3, 7] by reverse mode."""
-    function = partial(_outcome, model, height, origin)
-    return function(vector), jax.jacrev(function)(vector)
+def _jacobian(model: Any, height: Array, origin: Array, vector: Array) -> Array:
+    """Derivatives [3, 7] of the outcomes by reverse mode."""
+    jacobian: Array = jax.jacrev(Partial(_outcome, model, height, origin))(vector)
+    return jacobian
 
 
-def _jacobians(
-    model: Any, cases: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> Float[np.ndarray, "n 3 7"]:
+def _jacobians(model: Any, cases: Cycles) -> Float[np.ndarray, "n 3 7"]:
     """Derivatives of a model in the units, on every case."""
     rows = [
-        np.asarray(_value_and_jacobian(model, *map(jnp.asarray, case))[1])
-        for case in zip(*cases, strict=True)
+        np.asarray(_jacobian(model, *map(jnp.asarray, case))) for case in zip(*cases, strict=True)
     ]
-    return _in_its_frame(np.array(rows) * UNITS, cases[2])
+    return _in_its_frame(np.array(rows) * UNITS, cases.vector)
 
 
 def _in_its_frame(
@@ -144,7 +142,7 @@ def _in_its_frame(
 
 
 def _differences(
-    cases: tuple[np.ndarray, np.ndarray, np.ndarray],
+    cases: Cycles,
 ) -> dict[str, Float[np.ndarray, "n 3 7"]]:
     """Central differences of the simulator in the units, by name of the step."""
     widths = np.array(list(STEPS.values()))
@@ -155,10 +153,10 @@ def _differences(
         ahead, behind = np.moveaxis(values.reshape(3, len(widths), 2, 7), 2, 0)
         tables.append((ahead - behind) / (2.0 * widths[:, None]))
         if n % 20 == 0:
-            print(f"{n} of {len(cases[0])} cycles", file=sys.stderr, flush=True)
+            say(f"{n} of {len(cases.height)} cycles")
     by_step = np.moveaxis(np.array(tables), 2, 0)
     return {
-        name: _in_its_frame(table, cases[2]) for name, table in zip(STEPS, by_step, strict=True)
+        name: _in_its_frame(table, cases.vector) for name, table in zip(STEPS, by_step, strict=True)
     }
 
 
@@ -181,22 +179,15 @@ def _agreement(
 def summary(
     gradients: Float[np.ndarray, "n k"], differences: Float[np.ndarray, "n k"]
 ) -> dict[str, Any]:
-    """Median and 10th percentile of the cosines, and the share of those above 0.
-
-    A gradient that is zero points nowhere: its cosine counts as 0. Cycles without differences, in
-    which nothing is to be found, are left out.
-    """
-    sizes = np.linalg.norm(gradients, axis=1), np.linalg.norm(differences, axis=1)
-    some = sizes[1] > 0.0
-    products = (gradients * differences).sum(axis=1)[some]
-    cosines = products / np.maximum((sizes[0] * sizes[1])[some], 1e-300)
-    low, middle = np.percentile(cosines, [10.0, 50.0])
+    """Median and 10th percentile of the cosines, and the share of those above 0, see `cosines`."""
+    found, lengths = cosines(gradients, differences)
+    low, middle = np.percentile(found, [10.0, 50.0])
     return {
-        "cycles": int(some.sum()),
+        "cycles": len(found),
         "median": float(middle),
         "p10": float(low),
-        "positive": float((cosines > 0.0).mean()),
-        "median_length_ratio": float(np.median(sizes[0][some] / sizes[1][some])),
+        "positive": float((found > 0.0).mean()),
+        "median_length_ratio": float(np.median(lengths)),
     }
 
 
@@ -221,12 +212,9 @@ def _line(models: dict[str, Any], points: int) -> dict[str, Any]:
 
     curves = {}
     for title, model in models.items():
-        parts = [
-            _value_and_jacobian(model, *map(jnp.asarray, (height, origin, vector)))
-            for vector in vectors
-        ]
-        values, jacobians = (np.array([np.asarray(part[k]) for part in parts]) for k in (0, 1))
-        curves[title] = scaled(values, jacobians[:, :, 3:] @ (LINE[1] - LINE[0]))
+        function = Partial(_outcome, model, height, origin)
+        found = studies.line(function, vectors[0], vectors[-1] - vectors[0], place)
+        curves[title] = scaled(np.asarray(found.value), np.asarray(found.derivative))
     values, _ = replayed(height, origin, vectors)
     curves["simulator"] = scaled(values, np.gradient(values, place, axis=0))
     return {

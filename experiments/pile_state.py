@@ -1,8 +1,8 @@
 """Pile state predictors on held-out cycles: the paper's, as described, and ours, on one split.
 
-Paper, table 2 and figures 11 and 12: the volume between predicted and simulated surface, with and
-without the paper's post-processing, how it is spread, and five samples. Ours is given the simulated
-load, as `wlplan evaluate` does; the paper's predicts the map alone.
+Paper, table 2 and figures 5, 11 and 12: the volume between predicted and simulated surface, with
+and without the paper's post-processing, how it is spread, and five samples. Ours is given the
+simulated load, as `wlplan evaluate` does; the paper's predicts the map alone.
 """
 
 from __future__ import annotations
@@ -15,18 +15,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 
 from experiments._common.models import load_or_train, smoke_settings
 from experiments._common.results import dataset_summary, main
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset, split
 from wlplan.io import write_bytes_atomic
-from wlplan.models.phi_vae import VaePileStateModel
+from wlplan.models.phi_vae import VaePileStateModel, blended
 from wlplan.models.storage import load_model
 from wlplan.report.figures import png_bytes
+from wlplan.report.figures.relief import PILE
 from wlplan.report.figures.style import BLUE, FAINT, GREEN, INK, ORANGE, PALE, new_figure, tidy
+from wlplan.report.figures.surface import DIFFERENCE, FROM_BEHIND, draw_surface
 from wlplan.studies.paper import PILE_STATE
-from wlplan.terrain.heightmap import STATE_DISPLACEMENT
+from wlplan.terrain.heightmap import STATE_CELLS, STATE_DISPLACEMENT
 from wlplan.training import PhiSettings, PhiVaeSettings, Settings
 from wlplan.training.pile_state import misplaced_volume, pile_state_errors, predict_pile_state
 from wlplan.types import LocalHeightmap
@@ -148,7 +153,7 @@ def _sample(
 
 
 def draw(folder: Path) -> None:
-    """Figure 11 as pile_state.png, figure 12 as pile_state_samples.png."""
+    """Figures 11 and 5 as pile_state.png and post_processing.png, 12 as pile_state_samples*.png."""
     result = json.loads((folder / "pile_state.json").read_text())
     misplaced = {title: np.array(v) for title, v in result["misplaced_m3"].items()}
     figure = new_figure(10.5, 3.4)
@@ -187,6 +192,8 @@ def draw(folder: Path) -> None:
         tidy(panel)
     write_bytes_atomic(folder / "pile_state.png", png_bytes(figure))
     _draw_samples(result, folder)
+    _draw_samples_aside(result, folder)
+    _draw_post_processing(result["samples"], folder)
 
 
 def _draw_samples(result: dict[str, Any], folder: Path) -> None:
@@ -235,6 +242,111 @@ def _draw_samples(result: dict[str, Any], folder: Path) -> None:
         color=FAINT,
     )
     write_bytes_atomic(folder / "pile_state_samples.png", png_bytes(figure, dpi=110))
+
+
+def _draw_samples_aside(result: dict[str, Any], folder: Path) -> None:
+    """The samples as surfaces; those that are predicted in the colours of their errors."""
+    columns = ("before", "before, from its code", "after", PLAIN, BLENDED, OURS)
+    samples = result["samples"]
+    figure = new_figure(1.9 * len(columns), 1.5 * len(samples) + 0.6)
+    panels = figure.subplots(
+        len(samples), len(columns), squeeze=False, gridspec_kw={"wspace": 0.0, "hspace": 0.02}
+    )
+    wrong = Normalize(-WRONG, WRONG)
+    for number, (row, sample) in enumerate(zip(panels, samples, strict=True)):
+        before, after, coded = (
+            0.01 * np.array(sample[name]) for name in ("before_cm", "after_cm", "reconstructed_cm")
+        )
+        heights = Normalize(float(before.min()), float(before.max()))
+        shown: dict[str, tuple[np.ndarray, np.ndarray | None]] = {
+            "before": (before, None),
+            "before, from its code": (coded, coded - before),
+            "after": (after, None),
+        }
+        for title in (PLAIN, BLENDED, OURS):
+            predicted = 0.01 * np.array(sample["predicted_cm"][title])
+            shown[title] = (predicted, predicted - after)
+        for panel, title in zip(row, columns, strict=True):
+            height, error = shown[title]
+            draw_surface(
+                panel,
+                height,
+                2.0 * CELL_SIZE,
+                PILE if error is None else DIFFERENCE,
+                heights if error is None else wrong,
+                values=error,
+                base=float(before.min()) - 0.2,
+                view=FROM_BEHIND,
+            )
+            said = "" if number else title
+            if title in sample["misplaced_m3"]:
+                said += f"\n{sample['misplaced_m3'][title]:.2f} m³"
+            panel.set_title(said, fontsize=7, color=INK, y=0.92)
+        row[0].text(
+            *(0.0, 0.95, f"({'abcde'[number]}) {sample['of']}"),
+            transform=row[0].transAxes,
+            fontsize=7,
+            color=INK,
+        )
+    bar = figure.colorbar(
+        ScalarMappable(wrong, DIFFERENCE), ax=panels.ravel().tolist(), shrink=0.4, pad=0.01
+    )
+    bar.set_label("surface over what it ought to be [m]", fontsize=7)
+    bar.ax.tick_params(labelsize=6)
+    content = png_bytes(figure, dpi=110, rare_colours=True)
+    write_bytes_atomic(folder / "pile_state_samples_aside.png", content)
+
+
+def _draw_post_processing(samples: list[dict[str, Any]], folder: Path) -> None:
+    """The paper's post-processing on the sample that it helps most: what is mixed, and how.
+
+    Each map is coloured by height; it was dug from the left.
+    """
+    gains = [one["misplaced_m3"][PLAIN] - one["misplaced_m3"][BLENDED] for one in samples]
+    sample = samples[int(np.argmax(gains))]
+    heights = {
+        "before, h": sample["before_cm"],
+        "φ, as predicted": sample["predicted_cm"][PLAIN],
+        "weight × predicted + rest × h": sample["predicted_cm"][BLENDED],
+        "simulated": sample["after_cm"],
+    }
+    heights = {title: 0.01 * np.array(values) for title, values in heights.items()}
+    everything = np.concatenate([values.ravel() for values in heights.values()])
+    limits = {"vmin": float(everything.min()), "vmax": float(everything.max())}
+    weight = np.asarray(blended(jnp.ones((STATE_CELLS, STATE_CELLS))))
+    figure = new_figure(11.0, 2.6)
+    panels = figure.subplots(1, 5, sharex=True, sharey=True)
+    half = 0.5 * CELL_SIZE * STATE_CELLS
+
+    def show(panel: Axes, title: str, values: np.ndarray, **colours: Any) -> Any:
+        # Rows run ahead, which is to the right; columns to the left of the loader, which is up.
+        where = (-STATE_DISPLACEMENT, 2.0 * half - STATE_DISPLACEMENT, -half, half)
+        image = panel.imshow(values.T, origin="lower", extent=where, **colours)
+        panel.set_title(title, fontsize=8, color=INK)
+        panel.set_xlabel("ahead [m]", fontsize=7)
+        tidy(panel, grid=False)
+        panel.tick_params(labelsize=6)
+        return image
+
+    places = (panels[0], panels[1], panels[3], panels[4])
+    images = [
+        show(panel, title, values, cmap=PILE, **limits)
+        for panel, (title, values) in zip(places, heights.items(), strict=True)
+    ]
+    mask = show(panels[2], "weight of the prediction", weight, cmap="gray", vmin=0.0, vmax=1.0)
+    for panel, title in ((panels[1], PLAIN), (panels[3], BLENDED)):
+        panel.set_xlabel(
+            f"ahead [m]\nmisplaced: {sample['misplaced_m3'][title]:.2f} m³", fontsize=7
+        )
+    panels[0].set_ylabel("to the left [m]", fontsize=7)
+    for image, label, panel in (
+        (mask, "weight [1]", panels[2]),
+        (images[-1], "height [m]", panels[4]),
+    ):
+        bar = figure.colorbar(image, ax=panel, shrink=0.8, pad=0.02)
+        bar.set_label(label, fontsize=6)
+        bar.ax.tick_params(labelsize=6)
+    write_bytes_atomic(folder / "post_processing.png", png_bytes(figure, dpi=110))
 
 
 if __name__ == "__main__":

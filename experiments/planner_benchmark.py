@@ -10,11 +10,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import fnmatch
 import itertools
 import json
-import math
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,8 +32,17 @@ from experiments._common.comparison import (
     steps,
 )
 from experiments._common.instances import EACH, JOBS, PILES, SITES, SMOKE_JOB, Instance
-from experiments._common.results import PRESETS, RESULTS, write_result
+from experiments._common.places import RESULTS, add_places, folder_of, say
+from experiments._common.results import redraw, write_result
+from experiments._common.row_files import (
+    RowFiles,
+    add_row_options,
+    matching,
+    part_of,
+    time_is_up,
+)
 from wlplan.cli.progress import Stopwatch
+from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic, write_text_atomic
 from wlplan.planning.amounts import Made, typical_load
 from wlplan.planning.job import make_job, with_toe
@@ -228,7 +234,7 @@ def play_run(
     if receiver is not None:
         site = site.replace(receiver=receiver)
     row: dict[str, Any] = {**dataclasses.asdict(run.instance), "planner": run.planner}
-    row |= {"budget": run.budget, "seed": run.seed, "made_with": made_with(run, planner)}
+    row |= {"budget": run.budget, "seed": run.seed}
     hybrid, simulator = wlplan.load_world("hybrid"), wlplan.load_world("simulator")
     ratio = None if of_greedy is None else float(run.budget)
     in_referee = run.planner.endswith(IN_REFEREE)
@@ -286,50 +292,49 @@ def _summary(played: wlplan.PlanResult) -> dict[str, float]:
 
 def work(
     todo: Sequence[Run],
-    folder: Path,
+    rows: RowFiles,
     planners: dict[str, Callable[[int], Planner]],
-    until: float,
+    is_up: Callable[[], bool],
 ) -> None:
-    """Makes the rows that are not there yet.
+    """Makes the rows that are not there yet, and that no other process is making.
 
     Args:
         todo: Runs in order.
-        folder: Of the rows.
+        rows: Of the runs.
         planners: By name.
-        until: When no further run is begun, as `time.monotonic` has it.
+        is_up: Whether no further run is to be begun.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     pile = None
     for number, run in enumerate(todo):
-        if time.monotonic() > until:
+        if is_up():
             return
         # Maps of other extents have programs of their own, which would add up to many gigabytes.
         if run.instance.pile != pile:
             jax.clear_caches()
             pile = run.instance.pile
         planner = planners[run.planner](run.budget)
-        if (row := _read(folder / f"{run.name}.json")) and row["made_with"] == made_with(
-            run, planner
-        ):
+        if rows.read(run.name, made_with(run, planner)) is not None:
             continue
         of_greedy = None
         # What greedy takes is the unit, in the simulator too: there it takes a little more.
         if (run.planner, run.budget) not in BASES:
             base = dataclasses.replace(run, planner="greedy", budget=1)
-            work([base], folder, planners, until)
-            if (row := _read(folder / f"{base.name}.json")) is None:
-                return
+            work([base], rows, planners, is_up)
+            made = made_with(base, planners[base.planner](base.budget))
+            if (row := rows.read(base.name, made)) is None:
+                # The time is up, or another process is at it.
+                continue
             of_greedy = row["spent"] / row["rows"]
-        receiver = place_truck(run.instance, run.seed, folder / "places")
-        row = play_run(run, planner, of_greedy, receiver)
-        write_text_atomic(folder / f"{run.name}.json", json.dumps(row) + "\n")
-        said = {name: value for name, value in row.items() if name != "plan"}
-        print(f"{number + 1}/{len(todo)} {json.dumps(said)}", flush=True)
 
+        def make(
+            run: Run = run, planner: Planner = planner, of_greedy: float | None = of_greedy
+        ) -> dict[str, Any]:
+            receiver = place_truck(run.instance, run.seed, rows.folder / "places")
+            return play_run(run, planner, of_greedy, receiver)
 
-def _read(path: Path) -> dict[str, Any] | None:
-    row: dict[str, Any] | None = json.loads(path.read_text()) if path.exists() else None
-    return row
+        if (row := rows.get(run.name, made_with(run, planner), make)) is not None:
+            said = {name: value for name, value in row.items() if name != "plan"}
+            say(f"{number + 1}/{len(todo)} {json.dumps(said)}")
 
 
 def run(preset: str, rows: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
@@ -405,52 +410,46 @@ def draw(folder: Path) -> None:
 def main() -> None:
     """Command line: plan and play, join what was played, or draw."""
     parser = argparse.ArgumentParser(prog="python -m experiments.planner_benchmark")
-    parser.add_argument("--preset", choices=PRESETS, default="full")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of results")
-    parser.add_argument("--draw", action="store_true", help="only draw what is there")
-    parser.add_argument(
-        "--rows", type=Path, help=f"folder of the runs (default {ROWS}, for smoke a new one)"
-    )
-    parser.add_argument("--shard", default="1/1", help="make the I-th of N parts of the runs: I/N")
-    parser.add_argument(
-        "--minutes", type=float, default=math.inf, help="begin no run after so long"
-    )
-    parser.add_argument("--join", action="store_true", help="only join the runs that are there")
-    parser.add_argument(
-        "--only",
-        action="append",
-        metavar="PATTERN",
-        help="only runs whose name matches, as file names do in a shell; more of it: in this order",
-    )
+    add_places(parser)
+    add_row_options(parser, ROWS)
     parser.add_argument("--planner", action="append", default=[], metavar="MODULE:NAME")
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    rows_in = options.rows or (options.out / ROWS.name if options.preset == "smoke" else ROWS)
-    if not options.draw:
-        planners = PLANNERS | {name: _always(load_object(name)) for name in options.planner}
-        chosen = tuple(SMOKE if options.preset == "smoke" else planners)
-        if not options.join:
-            until = time.monotonic() + 60.0 * options.minutes
-            part, parts = (int(number) for number in options.shard.split("/"))
-            everything = runs(options.preset, chosen)
-            todo = [
-                run
-                for pattern in options.only or ["*"]
-                for run in everything
-                if fnmatch.fnmatchcase(run.name, pattern)
-            ]
-            shown = SMOKE if options.preset == "smoke" else planners
-            # All of an instance go to one machine, which then has what they are compared with.
-            places = list(dict.fromkeys((run.instance, run.seed) for run in todo))
-            mine = set(places[part - 1 :: parts])
-            work([r for r in todo if (r.instance, r.seed) in mine], rows_in, shown, until)
-        rows = [json.loads(path.read_text()) for path in sorted(rows_in.glob("*.json"))]
-        best = options.out / BEST
-        known = json.loads(best.read_text()) if best.exists() else []
-        lines = ",\n".join(json.dumps(one) for one in best_plans(rows, known))
-        write_text_atomic(best, f"[{lines}]\n")
-        write_result("planner_benchmark", options.preset, run(options.preset, rows), options.out)
-    draw(options.out)
+    try:
+        folder = folder_of(options)
+        if options.draw:
+            redraw("planner_benchmark", draw, folder)
+        else:
+            _make(options, folder)
+            draw(folder)
+    except InputError as error:
+        say(f"error: {error}")
+        raise SystemExit(2) from error
+
+
+def _make(options: argparse.Namespace, folder: Path) -> None:
+    """Makes the runs that are asked for, and joins all that are there."""
+    made = RowFiles(options.rows or (folder / ROWS.name if options.preset == "smoke" else ROWS))
+    say(f"planner_benchmark: runs in {made.folder}; the result goes to {folder}")
+    planners = PLANNERS | {name: _always(load_object(name)) for name in options.planner}
+    chosen = tuple(SMOKE if options.preset == "smoke" else planners)
+    if not options.join:
+        todo = matching(runs(options.preset, chosen), options.only)
+        shown = SMOKE if options.preset == "smoke" else planners
+        # All of an instance go to one machine, which then has what they are compared with.
+        places = list(dict.fromkeys((run.instance, run.seed) for run in todo))
+        mine = set(part_of(places, options.shard))
+        mine_alone = [r for r in todo if (r.instance, r.seed) in mine]
+        work(mine_alone, made, shown, time_is_up(options))
+    rows = made.all()
+    # The best plans known so far: those in the folder, or else the committed ones.
+    committed = [] if options.preset == "smoke" else [RESULTS / BEST]
+    known = next((path for path in (folder / BEST, *committed) if path.exists()), None)
+    lines = ",\n".join(
+        json.dumps(one)
+        for one in best_plans(rows, [] if known is None else json.loads(known.read_text()))
+    )
+    write_text_atomic(folder / BEST, f"[{lines}]\n")
+    write_result("planner_benchmark", options.preset, run(options.preset, rows), folder)
 
 
 # Few trials each: whether all goes through, and not what it comes to.

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 
 import wlplan
+from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.plan import play
@@ -68,7 +69,7 @@ def run(preset: str) -> dict[str, Any]:
                         "seconds_with_compile": seconds,
                     }
                 )
-                print(json.dumps(rows[-1]), flush=True)
+                say(json.dumps(rows[-1]))
     return {
         "loads": loads,
         "objective": "efficiency",

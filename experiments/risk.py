@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from scipy.stats import t as students_t
 
 import wlplan
+from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.engines.limits import STOP_REASONS
 from wlplan.engines.simulator import Simulator, dig
@@ -125,7 +126,7 @@ def played(
             )
             head = {"world": name, "pile": pile_name, "seed": seed, "caution": kind}
             rows.append({**head, **_row(world, planned, pile)})
-            print(json.dumps(rows[-1]), flush=True)
+            say(json.dumps(rows[-1]))
     return rows
 
 

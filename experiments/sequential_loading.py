@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +19,12 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments._common.models import load_or_train, smoke_settings
+from experiments._common.places import say
 from experiments._common.results import dataset_summary, main
 from experiments.error_distribution import STALL
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import Dataset
-from wlplan.dataset.protocol import Episode, choose_pose
+from wlplan.dataset.episode import Episode, choose_pose
 from wlplan.engines.simulator import Simulator
 from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic
@@ -68,7 +68,8 @@ class Sequence:
 
 
 @jax.jit
-def _load(world: World, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+def load(world: World, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+    """One loading in a world, compiled once for each."""
     return world(pile, pose, action)
 
 
@@ -82,7 +83,7 @@ def run(preset: str, data: Dataset, models: Path) -> dict[str, Any]:
     volumes = np.array([sequence.volumes for sequence in sequences])
     rows = {}
     for name, world in worlds.items():
-        print(f"{loads} loads on {piles} piles in the {name} world", file=sys.stderr, flush=True)
+        say(f"{loads} loads on {piles} piles in the {name} world")
         own = [predicted(world, sequence, own_pile=True) for sequence in sequences]
         given = [predicted(world, sequence, own_pile=False) for sequence in sequences]
         rows[name] = {
@@ -154,7 +155,7 @@ def simulated(number: int, loads: int) -> Sequence:
         pose = choose_pose(pile, place, turn)
         if pose is None:
             raise RuntimeError(f"pile {number} is used up after {len(poses)} loads")
-        pile, performance = _load(simulator, pile, _pose(pose), action_from(jnp.asarray(action)))
+        pile, performance = load(simulator, pile, pose_of(pose), action_from(jnp.asarray(action)))
         heights.append(np.asarray(pile.height))
         poses.append(pose)
         outcomes.append([float(getattr(performance, name)) for name in OUTCOMES])
@@ -191,7 +192,7 @@ def predicted(
         if not own_pile:
             pile = pile.replace(height=jnp.asarray(sequence.heights[n]))
         before = np.asarray(pile.height, np.float64)
-        pile, performance = _load(world, pile, _pose(pose), action_from(jnp.asarray(action)))
+        pile, performance = load(world, pile, pose_of(pose), action_from(jnp.asarray(action)))
         after = np.asarray(pile.height, np.float64)
         volume += (after - before).sum() * CELL_SIZE**2
         outcomes.append([float(getattr(performance, name)) for name in OUTCOMES])
@@ -200,7 +201,8 @@ def predicted(
     return np.array(outcomes), np.array(volumes), np.array(misplaced)
 
 
-def _pose(values: np.ndarray) -> Pose:
+def pose_of(values: np.ndarray) -> Pose:
+    """The pose of a row of a sequence."""
     return Pose(*jnp.asarray(values, jnp.float32))
 
 

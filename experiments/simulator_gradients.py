@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,9 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import wlplan
+from experiments._common.cycles import Cycles, random_cycles
+from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.constants import ACTION_HIGH, ACTION_LOW, CELL_SIZE, J_PER_KJ, KG_PER_TONNE
-from wlplan.dataset.protocol import Episode, choose_pose
 from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig
 from wlplan.io import write_bytes_atomic
 from wlplan.report.figures import png_bytes
@@ -53,7 +53,7 @@ def run(preset: str) -> dict[str, Any]:
     """Cosines between gradients and differences, and the line."""
     smoke = preset == "smoke"
     with jax.enable_x64(True):
-        cases = random_cases(1 if smoke else ROLLOUTS, 2 if smoke else LOADS)
+        cases = in_float64(1 if smoke else ROLLOUTS, 2 if smoke else LOADS)
         return {
             "step_units": UNITS.tolist(),
             "steps": STEPS,
@@ -62,26 +62,10 @@ def run(preset: str) -> dict[str, Any]:
         }
 
 
-def random_cases(rollouts: int, loads: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Piles as they are before random loadings in a row, their origins, and pose and action."""
-    simulator = Simulator()
-    play = jax.jit(lambda pile, pose, action: simulator(pile, pose, action)[0].height)
-    heights, origins, vectors = [], [], []
-    for number in range(rollouts):
-        episode = Episode(number, SEED, loads, simulator)
-        episode.reset()
-        height, origin = episode.height, episode.origin
-        for load in range(loads):
-            pile = Pile(height, CELL_SIZE, origin)
-            pose = choose_pose(pile, episode.place[load], episode.turn[load])
-            if pose is None:
-                break
-            action = episode.action[load]
-            heights.append(np.asarray(height, np.float64))
-            origins.append(np.asarray(origin, np.float64))
-            vectors.append(np.concatenate([pose, action]).astype(np.float64))
-            height = play(pile, Pose(*jnp.asarray(pose)), action_from(jnp.asarray(action)))
-    return np.array(heights), np.array(origins), np.array(vectors)
+def in_float64(rollouts: int, loads: int) -> Cycles:
+    """The cycles that gradients are compared on."""
+    found = random_cycles(rollouts, loads, seed=SEED)
+    return Cycles(*(np.asarray(part, np.float64) for part in found))
 
 
 def _outcomes(
@@ -134,7 +118,7 @@ class _Compared(NamedTuple):
     reasons: np.ndarray
 
 
-def _compared(cases: tuple[np.ndarray, np.ndarray, np.ndarray]) -> _Compared:
+def _compared(cases: Cycles) -> _Compared:
     """Reverse mode and differences of every loading."""
     shifts = np.concatenate(
         [np.zeros((1, 7)), *(sign * step * np.diag(UNITS) for step in _WIDTHS for sign in (1, -1))]
@@ -147,7 +131,7 @@ def _compared(cases: tuple[np.ndarray, np.ndarray, np.ndarray]) -> _Compared:
         values.append(value.T)
         reasons.append(int(reason[0]))
         if n % 20 == 0:
-            print(f"{n} of {len(cases[0])} cycles", file=sys.stderr)
+            say(f"{n} of {len(cases.height)} cycles")
     here, *there = np.split(np.array(values), [1, 8, 15, 22], axis=-1)
     forward = {name: (there[2 * k] - here) / step for k, (name, step) in enumerate(STEPS.items())}
     backward = {
@@ -156,7 +140,7 @@ def _compared(cases: tuple[np.ndarray, np.ndarray, np.ndarray]) -> _Compared:
     return _Compared(np.array(reverse), forward, backward, np.array(reasons))
 
 
-def _agreement(cases: tuple[np.ndarray, np.ndarray, np.ndarray]) -> dict[str, Any]:
+def _agreement(cases: Cycles) -> dict[str, Any]:
     """Gradients beside differences, cycle by cycle, and their cosines in all."""
     compared = _compared(cases)
     jacobians, reasons = compared.reverse, compared.reasons

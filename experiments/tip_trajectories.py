@@ -1,7 +1,7 @@
 """Paths of the bucket tip: of the cycles of the data set, and of two actions on five slopes.
 
-Paper, appendix A (all trajectories of the data set) and section 5.2 (two sets of action parameters
-on five piles with slopes between 30 and 10 degrees).
+Paper, figures 7 and 16: two sets of action parameters on five piles with slopes between 30 and 10
+degrees (section 5.2), and all trajectories of the data set (appendix A).
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ import numpy as np
 
 import wlplan
 from experiments._common.joint import refined
+from experiments._common.places import say
 from experiments._common.results import main
 from experiments._common.rows import Rows
 from wlplan.io import bundled_pile_path, write_bytes_atomic
@@ -118,7 +119,7 @@ def one(name: str, pile: Pile, kind: str, trucks: int, preset: str) -> dict[str,
         "seconds": time.perf_counter() - begun,
         "receiver": np.stack([np.asarray(v) for v in jax.tree.leaves(plan.receiver)]).tolist(),
     }
-    print(json.dumps(row), flush=True)
+    say(json.dumps(row))
     return row
 
 

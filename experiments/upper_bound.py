@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import wlplan
+from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.job import Decisions, contour_length, make_job, with_toe
@@ -63,7 +64,7 @@ def run(preset: str) -> dict[str, Any]:
             spread = max(0.93 * spread, 0.05)
         history.append(best_cost)
         if k % 10 == 0:
-            print(k, f"{best_cost:.4f}", f"spread {spread:.2f}", flush=True)
+            say(f"{k} {best_cost:.4f} spread {spread:.2f}")
     return {
         "pile": KIND,
         "slope_degrees": SLOPE_DEGREES,

@@ -18,9 +18,18 @@ os.environ.setdefault(
     "--xla_cpu_use_fusion_emitters=false",
 )
 
+import examples
 import jax
 import jaxtyping
+import pytest
 from browsers import browser as browser
 
 jaxtyping.install_import_hook("wlplan", "beartype.beartype")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+examples.load_profile()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """How much the tests do that can go on for as long as one likes; `make soak` does more."""
+    parser.addoption("--plans", type=int, default=500, help="random plans in each world")
+    parser.addoption("--kills", type=int, default=5, help="kills of `collect` and of `train`")

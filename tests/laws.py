@@ -23,9 +23,15 @@ def assert_volume_kept(before: ArrayLike, after: ArrayLike, *, relative: float =
 
 
 def assert_no_soil_from_nowhere(
-    before: Pile, after: Pile, mass: float, *, density: float, relative: float = 1e-6
-) -> None:
-    """A load is what left the pile, to `relative` of the pile; it is not negative, nor dug deeper.
+    before: Pile,
+    after: Pile,
+    mass: float,
+    *,
+    density: float,
+    relative: float = 1e-6,
+    absolute: float = 1e-6,
+) -> float:
+    """A load is what left the pile, apart from rounding; it is not negative, nor dug deeper.
 
     Args:
         before: Pile before the load.
@@ -33,15 +39,21 @@ def assert_no_soil_from_nowhere(
         mass: Of the load [tonne].
         density: Of the soil [tonne/m^3].
         relative: Largest part of the mass of the pile that may be off.
+        absolute: Largest mass that may be off anyway [tonne].
+
+    Returns:
+        What is off [tonne].
     """
     surfaces = [np.asarray(pile.height, np.float64) for pile in (before, after)]
     floor = np.asarray(before.floor, np.float64)
     was, now = (density * float((s - floor).sum()) * before.cell_size**2 for s in surfaces)
     assert mass >= 0.0, f"the load has a mass of {mass:g} t"
-    bound = relative * max(was, 1.0)
-    assert abs(was - now - mass) <= bound, f"{was - now:.9g} t left the pile, {mass:.9g} t were got"
+    off = abs(was - now - mass)
+    bound = max(relative * was, absolute)
+    assert off <= bound, f"{was - now:.9g} t left the pile, {mass:.9g} t were got"
     dug = float((surfaces[1] - floor).min())
     assert dug >= -1e-6, f"it is dug {-dug:g} m below its floor"
+    return off
 
 
 def assert_gradient(

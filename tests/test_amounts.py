@@ -183,6 +183,7 @@ def test_tonnes_end_with_the_bucket_that_reaches_them() -> None:
     assert result.plan.truck is None
 
 
+@pytest.mark.slow
 def test_the_referee_counts_what_is_done() -> None:
     """Its buckets hold a quarter more, so it takes fewer of them."""
 
@@ -249,6 +250,7 @@ def test_an_amount_is_read_as_it_was_written(amount: Amount) -> None:
     assert amount_fields(again) == fields
 
 
+@pytest.mark.slow
 def test_a_budget_ends_the_search_with_what_there_is() -> None:
     whole = plan_loads(bowl_world, cone(), loads=4, planner=GREEDY, site=SITE)
     assert whole.stopped == ""

@@ -392,6 +392,7 @@ def test_a_coarse_change_takes_no_more_from_a_cell_than_lies_there() -> None:
         assert_gradient(lambda at: (weight * added(at)).sum(), point, relative=1e-5)
 
 
+@pytest.mark.slow
 def test_gradient_through_several_windows_against_finite_differences() -> None:
     """A small window on a long slope, so that the avalanche needs more than one."""
     with jax.enable_x64(True):
@@ -411,6 +412,7 @@ def test_gradient_through_several_windows_against_finite_differences() -> None:
         assert_gradient(cost, dug, relative=1e-5, skip=8)
 
 
+@pytest.mark.slow
 def test_cells_outside_the_avalanche_keep_their_cotangent() -> None:
     pile = uneven(np.random.default_rng(5), shape=(24, 22))
     gradient = jax.jit(jax.grad(lambda h: settle(pile.replace(height=h)).pile.height.sum()))

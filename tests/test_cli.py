@@ -1009,7 +1009,7 @@ def test_no_command_shows_the_help(run: Run) -> None:
 
 
 def test_the_names_offered_are_those_that_exist() -> None:
-    assert cli.options.PROTOCOLS == dataset.PROTOCOLS
+    assert tuple(dataset.PROTOCOLS) == cli.options.PROTOCOLS
     assert set(cli.options.UPS) == set(TURNS)
 
 

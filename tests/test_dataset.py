@@ -35,20 +35,20 @@ from wlplan.dataset import (
     Dataset,
     collect,
     collecting,
+    episode,
     fingerprint,
     layout,
     merge,
     merging,
     open_dataset,
-    protocol,
     reflect,
     split,
     vector_simulator,
     worker_pool,
 )
 from wlplan.dataset import store as stored
+from wlplan.dataset.episode import Episode, choose_pose
 from wlplan.dataset.layout import Layout
-from wlplan.dataset.protocol import Episode, choose_pose
 from wlplan.dataset.worker import simulator_from_json
 from wlplan.dataset.worker_pool import CollectionSettings, FinishedEpisode, WorkerProcess
 from wlplan.engines.simulator import STOP_REASONS, Simulator
@@ -72,7 +72,7 @@ LONGER = 17
 def _short_episodes() -> Iterator[None]:
     """Episodes of 3 loadings, two a batch: 11 cycles make two batches."""
     with pytest.MonkeyPatch.context() as patch:
-        for part in (layout, protocol, worker_pool, collecting, stored):
+        for part in (layout, episode, worker_pool, collecting, stored):
             patch.setattr(part, "LOADS", 3)
         patch.setattr(layout, "_BATCH", 2)
         yield
@@ -319,7 +319,7 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The law of the protocol, with the fillings made up: every fourth is slow."""
-    monkeypatch.setattr(protocol, "choose_pose", lambda *_: np.zeros(3, np.float32))
+    monkeypatch.setattr(episode, "choose_pose", lambda *_: np.zeros(3, np.float32))
     span = np.subtract(ACTION_HIGH, ACTION_LOW)
     steps, fresh, count = [], 0, 0
     for number in range(60):
@@ -356,6 +356,35 @@ def test_slow_loadings_are_followed_by_ones_with_similar_actions(
     assert len(steps) > 1000
 
 
+def test_past_the_toe_is_before_and_behind_it_and_aslant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The law of the protocol: where a loading begins lies on its heading, near its place there."""
+    asked: list[np.ndarray | None] = []
+    turned: list[float] = []
+
+    def choose(pile: Pile, place: float, turn: float, near: np.ndarray | None) -> np.ndarray:
+        asked.append(near)
+        turned.append(turn)
+        return np.array([2.0, 3.0, 1.0 + turn], np.float32)
+
+    monkeypatch.setattr(episode, "choose_pose", choose)
+    ahead = []
+    for number in range(60):
+        mine = Episode(number, SEED, 30, Simulator(), length=30, protocol="past-toe")
+        mine.height, mine.origin = jnp.zeros((4, 4)), jnp.zeros(2)
+        for _ in range(30):
+            pose, _ = mine.next_loading()
+            c, s = np.cos(pose[2]), np.sin(pose[2])
+            dx, dy = pose[:2] - (2.0, 3.0)
+            assert abs(dy * c - dx * s) < 1e-5
+            ahead.append(dx * c + dy * s)
+            mine.loadings.append({"action": pose, "fill_time": 0.0})
+    for values, most in ((ahead, 1.0), (turned, math.radians(45.0))):
+        assert np.abs(values).max() <= most * (1.0 + 1e-5)
+        assert np.std(values) == pytest.approx(most / math.sqrt(3.0), rel=0.1)
+    # The first of an episode is anywhere.
+    assert np.mean([near is None for near in asked]) == pytest.approx(1 - 0.85 * 29 / 30, abs=0.03)
+
+
 @pytest.mark.slow
 def test_up_to_the_first_slow_loading_the_protocol_is_the_papers(worker: WorkerProcess) -> None:
     def episodes(protocol: str) -> list[FinishedEpisode]:
@@ -366,7 +395,7 @@ def test_up_to_the_first_slow_loading_the_protocol_is_the_papers(worker: WorkerP
 
     followed = 0
     for mine, papers in zip(episodes("slow"), episodes("paper"), strict=True):
-        slow = np.flatnonzero(mine.records["fill_time"] >= protocol._SLOW_FILLING)
+        slow = np.flatnonzero(mine.records["fill_time"] >= episode._SLOW_FILLING)
         first = slow[0] if len(slow) else 19
         for name in ("action", "pose", "mass"):
             np.testing.assert_array_equal(
@@ -380,9 +409,8 @@ def test_up_to_the_first_slow_loading_the_protocol_is_the_papers(worker: WorkerP
 
 def test_a_protocol_is_part_of_what_a_data_set_is(copy: Path) -> None:
     refused(lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="corridor"), "protocol")
-    refused(
-        lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="other"), "paper, corridor, slow"
-    )
+    other = lambda: collect(copy, cycles=CYCLES, seed=SEED, protocol="other")  # noqa: E731
+    refused(other, "paper, corridor, slow, past-toe")
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 3, 30, 31, 47, 449, 451, 1801, 10_718, 10_800])
@@ -633,7 +661,7 @@ def test_a_lock_that_is_not_signed_yet_is_left_alone(copy: Path) -> None:
     assert lock.exists()
 
 
-@pytest.mark.parametrize("holder", ["", "99999999 1 {host}", "{pid} 1 {host}"])
+@pytest.mark.parametrize("holder", ["", "99999999 12", "99999999 1 {host}", "{pid} 1 {host}"])
 def test_the_lock_of_a_dead_process_is_taken_over(copy: Path, holder: str) -> None:
     lock = copy.with_name("copy.zarr.lock")
     lock.write_text(holder.format(pid=os.getpid(), host=socket.gethostname()))
@@ -953,8 +981,8 @@ def test_the_command_line_collects_shards_and_merges_them(
 CHILD = """
 import sys
 from wlplan import cli
-from wlplan.dataset import collecting, layout, protocol, store, worker_pool
-for part in (layout, protocol, worker_pool, collecting, store):
+from wlplan.dataset import collecting, layout, episode, store, worker_pool
+for part in (layout, episode, worker_pool, collecting, store):
     part.LOADS = 3
 layout._BATCH = 2
 sys.exit(cli.main(["collect", *sys.argv[1:]]))
@@ -1074,8 +1102,21 @@ def test_no_rollout_is_in_two_parts(rollouts: int) -> None:
     np.testing.assert_array_equal(again[2].rollout, parts[2].rollout)
 
 
+def test_split_by_cycle_every_cycle_is_in_one_part_and_piles_are_in_several() -> None:
+    whole = numbered(10)
+    whole = dataclasses.replace(whole, mass=np.arange(len(whole), dtype=np.float32))
+    fractions = (0.81, 0.09, 0.1)
+    parts = split(whole, fractions=fractions, by="cycle")
+    numbers = np.concatenate([part.mass for part in parts])
+    np.testing.assert_array_equal(np.sort(numbers), whole.mass)
+    for part, fraction in zip(parts, fractions, strict=True):
+        assert len(part) == pytest.approx(fraction * len(whole), abs=2)
+    assert set(parts[2].rollout) <= set(parts[0].rollout)
+
+
 def test_too_few_rollouts_are_not_split() -> None:
     refused(lambda: split(numbered(2)), "2 rollouts")
+    refused(lambda: split(numbered(5), by="pile"), "rollout, cycle")
     refused(lambda: split(numbered(5), fractions=(0.8, -0.1)), "positive")
 
 

@@ -23,11 +23,15 @@ from wlplan.engines.dem.world import DiscreteElements
 from wlplan.engines.limits import BRAKE_TIME, MAX_PENETRATION, STOP_REASONS
 from wlplan.engines.simulator import loader as simulated
 from wlplan.errors import InputError
+from wlplan.planning import playing
+from wlplan.planning.job import make_job
 from wlplan.planning.plan import plan_loads, play
+from wlplan.planning.poses import toe_of
 from wlplan.planning.rollout import rollout
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, SAND, Soil
 from wlplan.terrain.heightmap import local_axes
+from wlplan.terrain.toe import toe_contour
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 from wlplan.worlds.shipped import load_world
 
@@ -438,6 +442,17 @@ def test_a_derivative_is_refused(jobs: list[tuple[dict[str, Any], dict[str, np.n
         jax.grad(lambda p: rollout(world, pile, p).performance.work.sum())(plan)
     with pytest.raises(InputError, match="no derivative"):
         plan_loads(world, pile, loads=1, planner="gradient")
+
+
+def test_nothing_is_played_ahead(
+    jobs: list[tuple[dict[str, Any], dict[str, np.ndarray]]],
+) -> None:
+    """While a plan is searched what plays it is compiled; what is not compiled is not played."""
+    pile = wide_pile()
+    job = make_job(DiscreteElements(), pile).replace(toe=toe_of(toe_contour(pile)))
+    playing.compile_ahead(job, (job.world,))
+    playing._ahead.wait()
+    assert jobs == []
 
 
 def test_what_was_played_is_read_and_not_played_again(

@@ -67,10 +67,11 @@ def check(world: Any, count: int, with_ground: bool) -> None:
             assert_no_soil_from_nowhere(pile, left, float(mass), density=DENSITY)
 
 
-WORLDS = ["high", "hybrid", pytest.param("simulator", marks=pytest.mark.slow)]
+LATER = pytest.mark.slow
+WORLDS = ["hybrid", *(pytest.param(name, marks=LATER) for name in ("high", "simulator"))]
 
 
-@pytest.mark.parametrize("with_ground", [False, True])
+@pytest.mark.parametrize("with_ground", [pytest.param(False, marks=LATER), True])
 @pytest.mark.parametrize("name", WORLDS)
 def test_a_load_at_an_edge_takes_what_is_there(name: str, with_ground: bool) -> None:
     check(wlplan.load_world(name), 256, with_ground)

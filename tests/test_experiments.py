@@ -3,7 +3,6 @@
 import importlib
 import inspect
 import json
-import pkgutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,20 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import experiments
 from experiments import action_landscape, dataset_overview, simulator_gradients
+from experiments._common import catalogue
 from experiments._common import results as record
 from wlplan.terrain.characteristics import as_vector, characteristics
 from wlplan.types import LocalHeightmap
 
 ROOT = Path(__file__).parents[1]
-# What the others share, and the recipe of a data set: none has a result of its own.
-OTHERS = {"_common", "dem_cycles"}
-NAMES = sorted(
-    module.name
-    for module in pkgutil.iter_modules(experiments.__path__)
-    if module.name not in OTHERS
-)
+NAMES = [one.name for one in catalogue.experiments()]
 
 
 def test_there_are_experiments_and_each_can_run_and_draw() -> None:

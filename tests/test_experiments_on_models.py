@@ -1,6 +1,7 @@
 """What the experiments on trained models compute: floors, sums of errors, cosines, kept models."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -10,16 +11,19 @@ from flax import struct
 from test_training import synthetic
 
 from experiments import (
+    hyperparameters,
     learning_curve,
     model_gradients,
     noise_floor,
+    protocol,
     reliability,
     sequential_loading,
 )
 from experiments._common.models import load_or_train as trained
+from experiments._common.training_rows import train_row
 from wlplan.constants import CELL_SIZE
 from wlplan.dataset import fingerprint
-from wlplan.training import PsiLowSettings
+from wlplan.training import PsiHighSettings, PsiLowSettings, Settings
 from wlplan.types import Action, Performance, Pile, Pose
 
 # --- models that are kept
@@ -69,6 +73,7 @@ def test_another_default_is_another_model(tmp_path: Path, monkeypatch: pytest.Mo
     assert len([path for path in tmp_path.iterdir() if path.is_dir()]) == 2
 
 
+@pytest.mark.slow
 def test_a_training_that_was_cut_short_has_no_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -95,6 +100,87 @@ def test_parts_of_the_learning_curve_are_drawn_without_repetition() -> None:
     assert epochs == learning_curve.LEAST_STEPS
     whole, _ = learning_curve._part(pool, 10_000, seed=0)
     assert fingerprint(whole) == fingerprint(pool)
+
+
+# --- the grid of the paper's appendix B, and its protocol
+
+
+def test_the_grid_has_the_papers_models_and_begins_with_a_part_of_all_kinds() -> None:
+    every = hyperparameters.runs("full")
+    assert len({one.name for one in every}) == len(every)
+    papers = [one for one in every if one.kind != hyperparameters.OURS and one.seed == 0]
+    assert len(papers) == 480
+    first = [one for one in every if one.is_first]
+    assert every[: len(first)] == first
+    for name, least in (("kind", 3), ("activation", 2), ("layers", 3), ("units", 5)):
+        assert len({getattr(one, name) for one in first}) >= least
+    costs = [one.cost for one in first]
+    assert costs == sorted(costs)
+
+
+def test_the_more_weights_and_cycles_the_dearer() -> None:
+    small = hyperparameters.Run("psi_low", "swish", 2, 64, 3000, 0)
+    for dearer in (
+        dataclasses.replace(small, units=4096),
+        dataclasses.replace(small, layers=3, units=512),
+        dataclasses.replace(small, samples=0),
+        dataclasses.replace(small, kind="psi_high"),
+    ):
+        assert dearer.cost > small.cost
+    few = dataclasses.replace(small, samples=100).settings
+    assert few.epochs * max(89 // few.batch, 1) >= hyperparameters.LEAST_STEPS
+
+
+def test_a_summary_says_how_much_of_the_grid_is_there() -> None:
+    data = synthetic(rollouts=3, loads=2)
+    data = dataclasses.replace(data, attributes={**data.attributes, "versions": {}})
+    one = hyperparameters.runs("full")[0]
+    row = {
+        "cycles": [90, 10, 20],
+        "mean_relative": {"mass": 0.1, "time": 0.2, "work": 0.3},
+        **dict.fromkeys(("parameters", "epochs", "best_epoch"), 7),
+        **dict.fromkeys(("epoch_s", "training_s", "inference_s", "inference_of_a_batch_s"), 0.5),
+    }
+    result = hyperparameters.run("full", data, {one.name: row})
+    assert result["parts"]["paper"]["done"] == int(one.kind != hyperparameters.OURS)
+    assert result["parts"]["all"]["trainings"] == len(hyperparameters.runs("full"))
+    (found,) = result["rows"]
+    assert dict(zip(result["columns"], found, strict=True))["cycles"] == 100
+
+
+def test_from_the_papers_protocol_every_step_changes_something_and_the_last_is_ours() -> None:
+    ends: tuple[tuple[list[protocol.Step], Settings], ...] = (
+        (list(protocol._low(0)), PsiLowSettings()),
+        (list(protocol._high(0)), PsiHighSettings(dropout=0.1)),
+    )
+    for steps, ours in ends:
+        for key, value in protocol.PAPER.items():
+            assert getattr(steps[0].settings, key) == value
+        for before, after in itertools.pairwise(steps):
+            assert before.settings != after.settings
+        assert steps[-1].settings == ours
+    names = [step.name for step in protocol.steps("full")]
+    assert len(set(names)) == len(names)
+
+
+def test_a_training_that_ends_with_its_epochs_is_not_called_converged() -> None:
+    def row(optimiser: str, epochs: int) -> dict[str, object]:
+        settings = {"optimiser": optimiser, "epochs": 100}
+        return {"epochs": epochs, "made_with": {"settings": settings}}
+
+    assert not protocol._is_converged(row("adam", 100))
+    assert protocol._is_converged(row("adam", 99))
+    assert protocol._is_converged(row("adamw", 100))
+
+
+def test_a_row_of_a_training_leaves_no_model_behind(tmp_path: Path) -> None:
+    data = synthetic(rollouts=10, loads=6)
+    row = train_row(PsiLowSettings(epochs=2, hidden=(4,)), data, tmp_path / "deep" / "m")
+    assert not list((tmp_path / "deep").iterdir())
+    assert row["parameters"] == 8 * 4 + 4 + 4 * 3 + 3
+    assert row["epochs"] == 2
+    assert sum(row["cycles"]) == len(data)
+    assert 0.0 < row["epoch_s"] < row["training_s"]
 
 
 # --- noise floor

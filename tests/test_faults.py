@@ -32,11 +32,12 @@ from faults import (
 )
 from flax import nnx
 from test_cli import FakeWorld, fake_play
+from test_store_machine import CYCLES, stand_ins
 
 from experiments._common.results import write_result
 from wlplan import cli
 from wlplan.cli.progress import Stopwatch
-from wlplan.dataset import collecting, store
+from wlplan.dataset import collect, collecting, store
 from wlplan.dataset.layout import Layout
 from wlplan.dataset.variables import VARIABLES
 from wlplan.errors import InputError
@@ -53,7 +54,7 @@ from wlplan.report import diggability_page, making, pictures
 from wlplan.report import figures as plots
 from wlplan.report.document import plan_document
 from wlplan.studies import diggability as studies
-from wlplan.studies.diggability import DiggabilityMap
+from wlplan.studies.diggability import DiggabilityMap, Foreseen
 from wlplan.studies.gradcheck import Component, GradientCheck
 from wlplan.terrain.seed_piles import seed_pile
 from wlplan.terrain.toe import edge_poses, toe_contour
@@ -384,8 +385,9 @@ def test_diggability_writes_all_or_nothing(
     values = np.arange(1.0, 4.0)
     found = DiggabilityMap(poses, Performance(values, values, values))
     monkeypatch.setattr(studies, "diggability_map", lambda *_, **__: found)
-    monkeypatch.setattr(studies, "stalls_on_map", lambda *_: None)
+    monkeypatch.setattr(studies, "foreseen_on_map", lambda *_: Foreseen(None, None))
     monkeypatch.setattr(diggability_page, "render_map", lambda *_, **__: f"<p>{MADE_BY}</p>")
+    monkeypatch.setattr(diggability_page, "map_figure", lambda *_, **__: None)
     out = old_files(folder / "out", "report.html", "diggability.json")
     run = command("diggability", scan, "--locations", 3, "--out", out, "--json")
     check_all_or_nothing(folder, kind, run)
@@ -496,6 +498,68 @@ def test_a_collection_goes_on_after_any_fault(
     assert count > 0
     for fault, _, left in rows:
         assert left == after, (fault.struck, sorted(set(left) ^ set(after)))
+
+
+@pytest.mark.slow
+def test_a_merge_writes_all_or_nothing(folder: Path, command: Command, tmp_path: Path) -> None:
+    """The shards stay as they are, and the same command then joins them."""
+    with stand_ins():
+        for number in (1, 2):
+            collect(tmp_path / f"{number}.zarr", cycles=CYCLES, shard=(number, 2))
+        shards = [tree(tmp_path / f"{number}.zarr") for number in (1, 2)]
+        words = ("collect", "--merge", tmp_path / "2.zarr", tmp_path / "1.zarr")
+        check_all_or_nothing(folder, ERROR, command(*words, "--out", folder / "data.zarr"))
+        assert shards == [tree(tmp_path / f"{number}.zarr") for number in (1, 2)]
+
+
+@pytest.mark.slow
+@each_kind
+def test_export_writes_all_or_nothing(
+    folder: Path, command: Command, scan: Path, kind: Kind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its command: what is exported is a stand-in, what is written is real."""
+
+    def write(_: object, place: Path, **__: object) -> list[object]:
+        with atomic_folder(place) as new:
+            for name in ("export.json", "check.npz"):
+                write_text_atomic(new / name, "{}")
+        return []
+
+    monkeypatch.setattr(export, "export", write)
+    monkeypatch.setattr("wlplan.portable.functions.portable", lambda *_: None)
+    words = ("export", "world", scan, "--out", folder / "out", "--json")
+    check_all_or_nothing(folder, kind, command(*words))
+
+
+@pytest.mark.slow
+@each_kind
+def test_train_writes_all_or_nothing(
+    folder: Path,
+    command: Command,
+    model: LowPerformanceModel,
+    tmp_path: Path,
+    kind: Kind,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By its command, with a stand-in for the training: the model is there whole, or not at all."""
+
+    def train(*_: object, out: str, **__: object) -> tuple[object, object]:
+        save_model(out, model, {})
+        return model, types.SimpleNamespace(as_dict=dict)
+
+    monkeypatch.setattr("wlplan.dataset.open_dataset", lambda _: None)
+    monkeypatch.setattr("wlplan.training.train", train)
+    (tmp_path / "data.zarr").mkdir()
+    run = command(
+        *("train", "psi-low", "--data", tmp_path / "data.zarr", "--out", folder / "m", "--json")
+    )
+    found: list[tuple[Fault, Ended, Tree]] = []
+    count, *_ = for_every_fault(folder, kind, run, lambda *row: found.append(row), same=loads)
+    assert count > 0
+    for fault, (code, said), left in found:
+        assert code in (0, 2, 130), (fault.struck, said)
+        assert code == 0 or said.count("\n") == 1, said
+        assert set(left) == set() or "m/model.json" in left, (fault.struck, sorted(left))
 
 
 @each_kind

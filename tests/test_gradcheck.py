@@ -284,6 +284,7 @@ def test_the_command_passes_the_world_that_ships(
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["gradcheck.json"]
 
 
+@pytest.mark.slow
 def test_a_wrong_gradient_ends_with_code_1(command: Callable[..., tuple[int, str, str]]) -> None:
     code, out, _ = command("--loads", 2, error=1e-3)
     assert code == 1

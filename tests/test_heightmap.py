@@ -10,7 +10,14 @@ from jax.typing import DTypeLike
 from laws import assert_gradient
 
 from wlplan.terrain import heightmap
-from wlplan.terrain.heightmap import local_axes, sample, take, to_local, to_world
+from wlplan.terrain.heightmap import (
+    local_axes,
+    sample,
+    sample_cubic,
+    take,
+    to_local,
+    to_world,
+)
 from wlplan.types import Pile, Pose
 
 add_local_change = jax.jit(heightmap.add_local_change, static_argnums=4)
@@ -52,6 +59,48 @@ def test_sampling_reproduces_a_plane_and_repeats_the_border() -> None:
     np.testing.assert_allclose(sample(pile.height, pile, x, y), 0.3 * x - 0.2 * y + 0.3, atol=1e-5)
     far = sample(pile.height, pile, jnp.asarray([-50.0]), jnp.asarray([-2.0]))
     np.testing.assert_allclose(far, pile.height[0, 0], atol=1e-6)
+
+
+def test_cubic_sampling_keeps_parabolas_inside_planes_at_the_border_and_values_at_cells() -> None:
+    with jax.enable_x64(True):
+        pile = plane(0.3, -0.2, dtype=jnp.float64)
+        x, y = jnp.asarray([-2.98, 0.123, 4.87]), jnp.asarray([4.88, 1.01, -1.97])
+        flat = 0.3 * x - 0.2 * y + 0.3
+        np.testing.assert_allclose(sample_cubic(pile.height, pile, x, y), flat, atol=1e-12)
+        far = sample_cubic(pile.height, pile, jnp.asarray([-50.0]), jnp.asarray([-2.0]))
+        np.testing.assert_allclose(far, pile.height[0, 0], atol=1e-12)
+        cells = jnp.asarray(np.random.default_rng(2).normal(size=pile.height.shape))
+        at = (jnp.asarray([-2.0, 1.5]), jnp.asarray([0.7, 3.0]))
+        wanted = cells[np.array([10, 45]), np.array([27, 50])]
+        np.testing.assert_allclose(sample_cubic(cells, pile, *at), wanted, atol=1e-10)
+        curved = jnp.asarray((np.arange(80.0) ** 2)[:, None] + np.arange(70.0) * 3.0)
+        u, v = jnp.asarray([20.37]), jnp.asarray([11.81])
+        found = sample_cubic(curved, pile, 0.1 * u - 3.0, 0.1 * v - 2.0)
+        np.testing.assert_allclose(found, u**2 + 3.0 * v, rtol=1e-12)
+
+
+def test_cubic_sampling_has_no_kink_where_bilinear_sampling_has_one() -> None:
+    with jax.enable_x64(True):
+        pile = bumpy(dtype=jnp.float64)
+        either = jnp.asarray([5.0 - 1e-9, 5.0 + 1e-9])
+        beside = jnp.full(2, 4.03)
+
+        def slopes(sampling: heightmap.Sampling) -> jax.Array:
+            found: jax.Array
+            found = jax.grad(lambda x: sampling(pile.height, pile, x, beside).sum())(either)
+            return found
+
+        left, right = slopes(sample_cubic)
+        np.testing.assert_allclose(left, right, atol=1e-6)
+        left, right = slopes(sample)
+        assert abs(left - right) > 1e-3
+
+
+def test_a_local_heightmap_is_sampled_as_is_asked() -> None:
+    pile, at = bumpy(), pose(3.0, 4.0, 0.7)
+    cubic = heightmap.sample_local(pile, at, sampling=sample_cubic).height
+    difference = np.abs(cubic - heightmap.sample_local(pile, at).height)
+    assert 1e-5 < difference.max() < 1e-2
 
 
 @pytest.mark.parametrize(("cells", "displacement"), [(36, 0.0), (52, 1.0)])

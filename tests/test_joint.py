@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from cones import SITE, bowl_world, circle, cone
 from laws import assert_gradient
 from precision import in_float64
@@ -43,6 +44,7 @@ def as_row(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[None], tree)
 
 
+@pytest.mark.slow
 def test_the_cost_of_a_plan_against_finite_differences_of_place_and_digs() -> None:
     with jax.enable_x64(True):
         job, plan = in_float64(job_on_the_cone(jnp.float64)), digs(jnp.float64)
@@ -64,6 +66,7 @@ def west_of(limit: float) -> Any:
     return lambda places: places[:, 0] <= limit
 
 
+@pytest.mark.slow
 def test_place_and_digs_get_cheaper_and_keep_to_where_a_truck_may_stand() -> None:
     job, plan = job_on_the_cone(), digs()
     start = outcomes(job, as_row(plan))
@@ -83,6 +86,7 @@ def test_place_and_digs_get_cheaper_and_keep_to_where_a_truck_may_stand() -> Non
         assert (place_of(found.receiver) != place_of(job.site.placed_receiver)).any()
 
 
+@pytest.mark.slow
 def test_trucks_that_are_just_full_stay_so() -> None:
     """The digs are at a kink: less in a truck costs much. The place is refined all the same."""
     plan = digs().replace(truck=jnp.asarray([0, 0]))

@@ -175,7 +175,7 @@ def pose_of(values: tuple[float, ...]) -> Pose:
 
 @pytest.fixture(scope="module")
 def solve() -> Plays:
-    run = jax.jit(Simulator().play)
+    run = jax.jit(Simulator(lane_soil=True).play)
     return partial(run, action=action_from(jnp.asarray(MODERATE)))
 
 
@@ -249,9 +249,9 @@ def test_an_episode_side_by_side_is_played_as_one_alone(solve: Plays) -> None:
             self.pose = np.array(at, np.float32)
             return self.pose, np.array(MODERATE, np.float32)
 
-    episodes, finished = iter([Lanes(0, 0, 3, Simulator(), length=3)]), list[Episode | None]()
+    episodes, finished = iter([Lanes(0, 0, 3, Simulator(lane_soil=True), length=3)]), list[Episode | None]()
     VectorSimulator(
-        Simulator(), lambda: next(episodes, None), finished.append, threading.Event()
+        Simulator(lane_soil=True), lambda: next(episodes, None), finished.append, threading.Event()
     ).run()
     (episode,) = (one for one in finished if one is not None)
     pile = pile_of(mound(4.6, 5.2), mound(6.0, 9.4)).replace(ground=None)
@@ -306,7 +306,7 @@ def test_gradients_through_the_lane_against_finite_differences() -> None:
 
 @pytest.mark.slow
 def test_gradients_of_a_loading_with_and_without_a_ridge_are_finite() -> None:
-    world = Simulator().with_derivatives()
+    world = Simulator(lane_soil=True).with_derivatives()
 
     @jax.jit
     def gradient(pile: Pile, vector: jax.Array) -> jax.Array:

@@ -9,6 +9,9 @@ from typing import Any
 
 import pytest
 
+from wlplan.cli.inputs import planner_named
+from wlplan.errors import InputError
+
 _MODULE = '''
 """Somebody else's planner, objective and world."""
 
@@ -87,6 +90,7 @@ def command(folder: Path, *words: object) -> dict[str, Any]:
     return document
 
 
+@pytest.mark.slow
 def test_planner_objective_and_world_run_from_the_command_line(folder: Path) -> None:
     document = command(
         folder,
@@ -117,3 +121,8 @@ def test_they_are_values_in_python_too(folder: Path, monkeypatch: pytest.MonkeyP
     fixed = wlplan.plan_loads(mine.flat, pile, loads=2, planner=mine.Fixed(), objective=mine.goal)
     assert fixed.plan.pose.x.tolist() == [-6.0, -6.0]
     assert fixed.terms["north"].tolist() == [0.0, 0.0]
+
+
+def test_what_is_no_planner_is_told_where_it_is_named() -> None:
+    with pytest.raises(InputError, match=r"3\.14\S* is no planner"):
+        planner_named("math:pi")

@@ -101,7 +101,7 @@ def test_only_accessible_points_are_dug() -> None:
         assert accessible[round(turn) % 290] or accessible[round(turn - 0.6) % 290]
 
 
-@pytest.mark.parametrize("planner", [GREEDY, NOMINAL])
+@pytest.mark.parametrize("planner", [GREEDY, pytest.param(NOMINAL, marks=pytest.mark.slow)])
 def test_the_best_action_is_found(planner: Greedy | Nominal) -> None:
     plan = plan_loads(
         bowl_world, cone(), loads=2, planner=planner, contour=circle(), site=SITE
@@ -190,6 +190,7 @@ class Blind(Greedy):
     plays_in_referee = False
 
 
+@pytest.mark.slow
 def test_greedy_makes_the_load_that_is_best_as_the_referee_plays_it() -> None:
     def fails_where_it_is_best(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         after, performance = bowl_world(pile, pose, action)
@@ -253,7 +254,11 @@ def test_bad_requests_are_refused() -> None:
         plan_loads(bowl_world, Pile(jnp.zeros((100, 100)), 0.1))
 
 
-@pytest.mark.parametrize("planner", [GREEDY, NOMINAL, GRADIENT], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize(
+    "planner",
+    [NOMINAL, *(pytest.param(one, marks=pytest.mark.slow) for one in (GREEDY, GRADIENT))],
+    ids=lambda one: type(one).__name__,
+)
 def test_a_cost_that_is_never_finite_is_one_clear_error(planner: Any) -> None:
     def even(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         return pile, Performance(
@@ -287,6 +292,7 @@ def test_a_plan_can_be_made_of_loading_plan_leaves() -> None:
 
 
 # The last one, for it clears what the others share.
+@pytest.mark.slow
 def test_another_pile_on_the_same_grid_needs_no_compiling(caplog: pytest.LogCaptureFixture) -> None:
     """The next action has to come within a second, on a pile whose toe the last load changed."""
     first, second = cone(), cone(radius=3.0)

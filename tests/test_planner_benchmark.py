@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from experiments import planner_benchmark as benchmark
 from experiments._common import comparison
 from experiments._common.budgets import OverBudget, Within
 from experiments._common.instances import Instance
+from experiments._common.row_files import RowFiles, part_of
 from wlplan.planning.amounts import Loads
 from wlplan.planning.job import Job, make_job, with_toe
 from wlplan.planning.planners import Greedy, RandomSearch
@@ -55,6 +55,7 @@ def test_a_budget_is_spent_and_kept() -> None:
     assert within.predicted <= few.predicted
 
 
+@pytest.mark.slow
 def test_half_a_plan_is_none() -> None:
     asked, watch = job(), Watch()
     GREEDY.propose(asked, 2, seed=0, progress=watch)
@@ -142,7 +143,7 @@ def test_shards_share_the_runs_out() -> None:
     runs = benchmark.runs("full", tuple(benchmark.PLANNERS))
     names = [run.name for run in runs]
     assert len(set(names)) == len(names)
-    parts = [runs[k::3] for k in range(3)]
+    parts = [part_of(runs, (k, 3)) for k in (1, 2, 3)]
     assert sorted(run.name for part in parts for run in part) == sorted(names)
     assert runs[0].planner == "greedy"
 
@@ -154,16 +155,24 @@ def test_what_was_run_is_run_again_only_with_other_settings(
     place = tmp_path / f"{run.name}.json"
     row = {"kept": True, "made_with": benchmark.made_with(run, GREEDY)}
     place.write_text(json.dumps(row))
+    rows = RowFiles(tmp_path)
     of: dict[str, Callable[[int], Planner]] = {run.planner: lambda budget: GREEDY}
-    benchmark.work([run], tmp_path, of, time.monotonic() + 60.0)
+    benchmark.work([run], rows, of, lambda: False)
     assert json.loads(place.read_text()) == row
     other: dict[str, Callable[[int], Planner]] = {run.planner: lambda budget: RANDOM}
     monkeypatch.setattr(benchmark, "play_run", lambda *_: {"anew": True})
-    benchmark.work([run], tmp_path, other, time.monotonic() + 60.0)
-    assert json.loads(place.read_text()) == {"anew": True}
+    benchmark.work([run], rows, other, lambda: True)
+    assert json.loads(place.read_text()) == row
+    benchmark.work([run], rows, other, lambda: False)
+    assert json.loads(place.read_text()) == {
+        "anew": True,
+        "made_with": benchmark.made_with(run, RANDOM),
+    }
 
 
-@pytest.mark.parametrize("name", ["prism 0", "cone", "bundled"])
+@pytest.mark.parametrize(
+    "name", ["cone", *(pytest.param(one, marks=pytest.mark.slow) for one in ("prism 0", "bundled"))]
+)
 def test_walls_stand_around_the_soil_and_leave_the_west_open(name: str) -> None:
     instance = Instance(name, "15 loads", "walls")
     pile = instance.load_pile()

@@ -20,7 +20,7 @@ from wlplan.errors import InputError
 from wlplan.report import figures as plots
 from wlplan.report.figures.digs import MOST_NUMBERED, number_places
 from wlplan.report.figures.plan import PlanOnPile, has_unseen, key_of
-from wlplan.report.figures.relief import _relief, shaped
+from wlplan.report.figures.relief import brightness, shaped
 from wlplan.report.pictures import galleries_of
 from wlplan.site.receiver import Receiver
 from wlplan.studies.diggability import DiggabilityMap
@@ -247,7 +247,7 @@ def test_a_view_grows_towards_a_place_and_no_further_than_it_has_to() -> None:
 
 def test_slopes_that_face_the_light_are_brighter() -> None:
     x = np.arange(20.0)[:, np.newaxis] * np.ones(20)
-    level, west, east = (_relief(slope * x, 1.0) for slope in (0.0, 0.5, -0.5))
+    level, west, east = (brightness(slope * x, 1.0) for slope in (0.0, 0.5, -0.5))
     np.testing.assert_allclose(level, 1.0)
     assert west.min() > 1.0 > east.max()
 

@@ -261,7 +261,9 @@ def _psi_low(*, scattered: bool = False, seed: int = 0) -> LowPerformanceModel:
 def _ensemble() -> Ensemble:
     members = [_psi_low(scattered=True, seed=seed) for seed in (0, 1)]
     params = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one.params for one in members))
-    return Ensemble(members[0].replace(params=params), jnp.array([1.0, 1.5, 2.0]))
+    return Ensemble(
+        members[0].replace(params=params), jnp.array([1.0, 1.5, 2.0]), jnp.array([0.0, 0.1, 0.2])
+    )
 
 
 def _psi_high(encoder: str) -> HighPerformanceModel:

@@ -187,7 +187,7 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(
     )
     monkeypatch.setattr(weights, "collect", collect)
     monkeypatch.setattr(weights, "open_dataset", lambda path: few)
-    monkeypatch.setattr(weights, "is_new", lambda path: len(collected) < 5)
+    monkeypatch.setattr(weights, "is_new", lambda path: len(collected) < 6)
     monkeypatch.setattr(weights, "read_attributes", lambda path: {"cycles": 1, "cycles_done": 1})
 
     def train(
@@ -219,7 +219,7 @@ def test_all_models_are_trained_by_one_call_which_goes_on_where_it_was(
         ("d-corridor.zarr", 10_800, 4, "corridor"),
     ]
     # No two data sets share their piles, or their place.
-    assert len({name for name, *_ in collected}) == len({seed for *_, seed, _ in collected}) == 5
+    assert len({name for name, *_ in collected}) == len({seed for *_, seed, _ in collected}) == 6
     assert trained == [("psi_low", 3), "broke", ("psi_high", 3), ("phi", 3), ("stall", 3)]
     assert told[0] == ("cycles, d.zarr", 10_800, 10_800)
     assert set(reports) == set(SHIPPED)

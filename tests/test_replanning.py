@@ -32,6 +32,7 @@ def part_of(pile: Pile, cells: int) -> Pile:
     return pile.replace(height=pile.height[:-cells])
 
 
+@pytest.mark.slow
 def test_a_scan_of_another_extent_needs_no_compiling(caplog: pytest.LogCaptureFixture) -> None:
     def compilations(planner: Replanner, pile: Pile) -> list[str]:
         caplog.clear()
@@ -72,6 +73,7 @@ def test_what_is_beyond_the_scan_is_unseen_and_no_pile() -> None:
     assert float((whole.height - whole.floor)[~valid].max()) == 0.0
 
 
+@pytest.mark.slow
 def test_trucks_are_filled_by_what_the_scale_says() -> None:
     planner = replanner(amount=Trucks(1, 8.0))
     pile, told = cone(), []
@@ -96,6 +98,7 @@ def test_an_operator_may_send_the_truck_off() -> None:
     assert planner.is_done
 
 
+@pytest.mark.slow
 def test_tonnes_end() -> None:
     planner = replanner(amount=Tonnes(4.0))
     planner.next_load(cone())

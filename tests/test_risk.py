@@ -146,6 +146,7 @@ def test_to_plan_for_what_the_world_does_not_know_is_refused(pile: Pile, name: s
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_plan_says_how_likely_its_loads_stall_and_caution_makes_it_less_so(pile: Pile) -> None:
     # The truck stands in the north, where loads are most likely to stall.
     site = Site(receiver=wlplan.Receiver(*(jnp.float32(v) for v in (0.0, 11.0, 0.0))))

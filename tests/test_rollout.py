@@ -221,6 +221,7 @@ def cost_in(world: World, pile: Pile) -> Callable[[LoadingPlan], jax.Array]:
     return lambda plan: play_candidate(job, plan, report=False).cost
 
 
+@pytest.mark.slow
 def test_gradient_of_five_loadings_against_finite_differences(
     low: World, cone: tuple[Pile, np.ndarray]
 ) -> None:
@@ -364,6 +365,7 @@ def each_wild_plan(
     return results, [f"pile {k}, {row}" for k, row in zip(which, rows, strict=True)]
 
 
+@pytest.mark.slow
 @ANY_PLAN
 def test_gradients_are_finite_for_any_plan(low: World, plans: int, floor: bool) -> None:
     def check(pile: Pile, plan: LoadingPlan) -> tuple[jax.Array, jax.Array]:

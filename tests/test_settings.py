@@ -41,6 +41,12 @@ def test_every_setting_has_a_meaning_and_a_default_that_it_allows(kind: str) -> 
         ({"activation": "tanh"}, "swish, leaky_relu"),
         ({"loss": "cubed"}, "huber, squared"),
         ({"encoder": "magic"}, "convolutional, principal"),
+        ({"optimiser": "sgd"}, "adamw, adam"),
+        ({"patience": -1}, "at least 0"),
+        ({"split": "pile"}, "rollout, cycle"),
+        ({"scaling": "none"}, "spread, min-max"),
+        ({"samples": -1}, "at least 0"),
+        ({"mirrored": 1.5}, "at most 1"),
     ],
 )
 def test_what_a_setting_may_not_be_is_refused_in_one_line(
@@ -50,6 +56,12 @@ def test_what_a_setting_may_not_be_is_refused_in_one_line(
         PsiHighSettings(**change)
     assert next(iter(change)) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_components_have_no_range_to_scale_to() -> None:
+    with pytest.raises(InputError, match="encoder has to be convolutional"):
+        PsiHighSettings(scaling="min-max")
+    PsiHighSettings(scaling="min-max", encoder="convolutional")
 
 
 @pytest.mark.parametrize(("value", "default"), [(1.5, 1), ("1", 1), (True, 1), (True, 1.0)])

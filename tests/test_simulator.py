@@ -146,7 +146,7 @@ def test_what_leaves_the_grid_is_the_load(loadings: Loadings) -> None:
     for group in (seeds, uneven):
         np.testing.assert_allclose(lost[group], mass[group], rtol=1e-5)
     np.testing.assert_allclose(lost[nothing], 0.0, atol=1e-6)
-    np.testing.assert_allclose(np.asarray(cycle.mass), 1000.0 * mass, rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(cycle.mass), 1000.0 * mass, rtol=2e-5, atol=1e-3)
 
 
 def test_the_ledger_can_fail(loadings: Loadings) -> None:

@@ -207,6 +207,7 @@ def test_data_in_which_nothing_stalls_is_refused(data: Dataset) -> None:
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_killed_training_ends_alike(
     data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -115,6 +115,19 @@ def test_a_pile_that_leans_on_a_building_is_soil() -> None:
     assert not (labels[x > 10.2] > 0).any()
 
 
+def test_a_wall_in_a_scan_that_hardly_saw_anything_is_found() -> None:
+    """Further from all that was seen than anything stands high, there is nothing to compare."""
+    cell, cells = 0.1, 400
+    height = np.zeros((cells, 40), np.float32)
+    height[20:24, 10:30] = 3.0
+    valid = np.zeros(height.shape, bool)
+    valid[:40] = True
+    labels, found = find_structures(height, cell, np.zeros(2), valid)
+    assert len(found) == 1
+    assert labels[22, 20] == 1
+    assert not labels[40:].any()
+
+
 def test_what_stands_over_a_sloping_floor() -> None:
     slope = 0.15 * CELL * np.arange(200)[:, None] * np.ones((1, 160))
     assert not standing(slope, CELL).any()

@@ -182,6 +182,95 @@ def test_data_that_cannot_be_trained_on_is_refused(data: Dataset) -> None:
     refused(lambda: dataclasses.replace(LIGHT, epochs=0), "at least 1")
 
 
+# --- the paper's protocol
+
+
+def test_patience_ends_a_training_that_gets_no_better(data: Dataset, tmp_path: Path) -> None:
+    settings = dataclasses.replace(
+        LIGHT, hidden=(8,), optimiser="adam", learning_rate=1e-30, epochs=9, patience=3
+    )
+    seen: list[int] = []
+    train(settings, data, out=tmp_path / "m", progress=lambda done, _: seen.append(done))
+    # The first epoch is the best of all that change nothing.
+    assert seen == [1, 2, 3, 4]
+    record = read_description(tmp_path / "m")["training"]
+    assert (record["epochs"], record["best_epoch"]) == (4, 1)
+    assert record["optimiser"] == "Adam, constant rate"
+    saved = fitting.SavedState(tmp_path / ".m.training.npz", {})
+    assert saved.load(fitting.Fit(*[0.0] * 6)) is None
+
+
+def test_a_training_that_still_gets_better_goes_on_to_its_end() -> None:
+    others = dict.fromkeys(("params", "rest", "optimiser", "best", "best_loss"))
+    fits = [fitting.Fit(**others, best_epoch=jnp.asarray(epoch)) for epoch in (5, 2, [2, 5])]
+    assert [fitting._is_converged(fit, 6, 3) for fit in fits] == [False, True, False]
+    assert not fitting._is_converged(fits[1], 1000, 0)
+
+
+def test_adam_keeps_its_rate_and_lets_weights_be() -> None:
+    weights = jnp.ones(4)
+
+    def steps(optimiser: str, gradient: float) -> tuple[jax.Array, list[float]]:
+        settings = dataclasses.replace(LIGHT, optimiser=optimiser, learning_rate=1e-2)
+        chain = fitting._optimiser(settings, 40)
+        state, at, sizes = chain.init(weights), weights, []
+        for _ in range(40):
+            change, state = chain.update(jnp.full(4, gradient), state, at)
+            sizes.append(float(jnp.abs(change).max()))
+            at = jnp.asarray(optax.apply_updates(at, change))
+        return at, sizes
+
+    assert np.allclose(steps("adam", 1.0)[1], 1e-2, rtol=1e-3)
+    sizes = steps("adamw", 1.0)[1]
+    assert sizes[0] < 1e-3 < max(sizes)
+    assert sizes[-1] < 1e-3
+    np.testing.assert_array_equal(steps("adam", 0.0)[0], weights)
+    assert float(steps("adamw", 0.0)[0].max()) < 1.0
+
+
+def test_scaled_by_the_range_a_network_has_no_units_of_its_own(data: Dataset) -> None:
+    def scales(scaling: str) -> list[np.ndarray]:
+        model, _ = train(dataclasses.replace(ONE_EPOCH, scaling=scaling), data)
+        network = nnx.merge(model.graph, model.params)
+        units = (network.scale_in, network.scale_out)
+        return [np.asarray(each[...]) for unit in units for each in (unit.mean, unit.spread)]
+
+    assert all(set(each.tolist()) <= {0.0, 1.0} for each in scales("min-max"))
+    assert not any(set(each.tolist()) <= {0.0, 1.0} for each in scales("spread"))
+
+
+def test_of_so_many_samples_a_training_sees_no_more_and_the_test_part_stays(
+    data: Dataset, tmp_path: Path
+) -> None:
+    counts = {}
+    for samples in (0, 90, 100_000):
+        place = tmp_path / str(samples)
+        train(dataclasses.replace(ONE_EPOCH, samples=samples), data, out=place)
+        counts[samples] = read_description(place)["training"]["cycles"]
+    assert counts[90] == [80, 10, counts[0][2]]
+    assert counts[100_000] == counts[0]
+
+
+def test_of_a_model_that_was_split_by_cycle_the_same_cycles_are_held_out(
+    data: Dataset, tmp_path: Path
+) -> None:
+    settings = dataclasses.replace(ONE_EPOCH, split="cycle")
+    model, report = train(settings, data, out=tmp_path / "model")
+    assert isinstance(report, EvaluationReport)
+    part = held_out(data, read_description(tmp_path / "model"))
+    assert len(part) == pytest.approx(0.1 * len(data), abs=1)
+    assert len(np.unique(part.rollout)) > 0.5 * len(np.unique(data.rollout))
+    assert evaluate_performance(model, part).as_dict() == report.as_dict()
+
+
+def test_a_part_of_the_maps_is_mirrored() -> None:
+    maps = jnp.arange(2.0 * 3.0 * 4.0).reshape(2, 3, 4)
+    for part, wanted in ((0.0, maps), (1.0, maps[:, :, ::-1])):
+        mirrored, which = fitting.mirror_some(jax.random.key(0), maps, part)
+        np.testing.assert_array_equal(mirrored, wanted)
+        assert which.all() == (part == 1.0)
+
+
 # --- evaluation
 
 

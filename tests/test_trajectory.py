@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan.engines.simulator import STOP_REASONS, Settings, dig, trace
+from wlplan.engines.simulator import STOP_REASONS, Section, Settings, dig, trace, trace_section
 from wlplan.engines.simulator.cycle import Cycle
 from wlplan.engines.simulator.trajectory import Trajectory
 from wlplan.site.machine import WA320
+from wlplan.site.soil import GRAVEL
 from wlplan.terrain.heightmap import local_axes
 from wlplan.types import action_from
 
@@ -89,3 +90,36 @@ def test_a_batch_equals_its_members(both: tuple[Cycle, Trajectory]) -> None:
     alone = jax.jit(trace)(HEIGHT, jnp.zeros_like(HEIGHT), action_from(jnp.asarray(ACTIONS[1])))
     for one, all_ in zip(jax.tree.leaves(alone), jax.tree.leaves(trajectory), strict=True):
         np.testing.assert_allclose(one, all_[1], rtol=1e-4, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def sections() -> tuple[Trajectory, Section]:
+    both: tuple[Trajectory, Section] = played(trace_section)
+    return both
+
+
+def test_the_section_is_of_the_same_motion_and_ends_as_the_cycle_leaves_the_soil(
+    both: tuple[Cycle, Trajectory], sections: tuple[Trajectory, Section]
+) -> None:
+    cycle, trajectory = both
+    path, section = sections
+    np.testing.assert_allclose(path.tip_x, trajectory.tip_x, atol=1e-4)
+    middle = np.asarray(cycle.height)[:, :, 25:27].mean(axis=-1)
+    np.testing.assert_allclose(section.surface[:, -1], middle, atol=2e-3)
+    before = np.broadcast_to(np.asarray(HEIGHT)[:, 25], section.surface[:, 0].shape)
+    np.testing.assert_allclose(section.surface[:, 0], before, atol=1e-6)
+    # The surface is dug in the middle, and not where the bucket did not come.
+    assert (section.surface[:, -1] - before).min() < -0.2
+
+
+def test_what_lies_in_the_middle_of_the_bucket_is_of_the_order_of_the_mean(
+    sections: tuple[Trajectory, Section],
+) -> None:
+    path, section = sections
+    np.testing.assert_array_equal(section.content[:, 0], 0.0)
+    mean = path.mass / GRAVEL.density / WA320.bucket_width
+    loaded = path.mass[:, -1] > 500.0
+    assert loaded.any()
+    ratio = section.content[loaded, -1] / mean[loaded, -1]
+    assert (ratio > 0.95).all()
+    assert (ratio < 1.6).all()

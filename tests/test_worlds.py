@@ -160,6 +160,7 @@ def test_a_solve_is_a_call_that_says_how_it_ended(scene: Scene, name: str) -> No
     assert abs(float(report.missing)) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_played_plan_says_how_its_solves_ended(scene: Scene) -> None:
     pile, pose, action = scene
     plan = LoadingPlan(*jax.tree.map(lambda leaf: leaf[None], (pose, action)))

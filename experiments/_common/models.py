@@ -6,13 +6,13 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import jax
 
+from experiments._common.places import say
 from wlplan import training
 from wlplan.dataset import Dataset, fingerprint
 from wlplan.errors import InputError
@@ -96,7 +96,7 @@ def load_or_train(models: Path, data: Dataset, settings: Settings) -> tuple[Any,
     begun = timing.is_file()
     models.mkdir(parents=True, exist_ok=True)
     write_text_atomic(timing, json.dumps({"training_s": None}))
-    print(f"training {folder.name}", file=sys.stderr, flush=True)
+    say(f"training {folder.name}")
     start = time.perf_counter()
     model, _ = training.train(settings, data, out=folder)
     seconds = None if begun else time.perf_counter() - start

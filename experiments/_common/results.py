@@ -8,7 +8,9 @@ import inspect
 import json
 import platform
 import re
-import sys
+import shutil
+import tempfile
+import time
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -17,13 +19,12 @@ from typing import Any
 import jax
 
 import wlplan
+from experiments._common.places import RESULTS, add_places, folder_of, say
 from wlplan.dataset import Dataset, collect, fingerprint, open_dataset
 from wlplan.errors import InputError
-from wlplan.io import write_text_atomic
+from wlplan.io import write_bytes_atomic, write_text_atomic
 from wlplan.xla import cores
 
-RESULTS = Path(__file__).parents[1] / "results"
-PRESETS = ("full", "smoke")
 # The data set of the experiments that need one: where it lies, and its cycles. Paper, section 6.2.
 DATA = Path("out") / "cycles.zarr"
 CYCLES, SMOKE_CYCLES = 10_800, 180
@@ -45,13 +46,30 @@ def conditions() -> dict[str, Any]:
     }
 
 
-def write_result(name: str, preset: str, result: dict[str, Any], folder: Path) -> Path:
-    """Writes a result with its conditions as JSON."""
+def write_result(
+    name: str,
+    preset: str,
+    result: dict[str, Any],
+    folder: Path,
+    *,
+    seconds: float | None = None,
+) -> Path:
+    """Writes a result with its conditions as JSON.
+
+    Args:
+        name: Of the experiment.
+        preset: Of the run.
+        result: What it found.
+        folder: Of results.
+        seconds: How long the run took [s], if it ran in one go. Models and rows that were there
+            before are not in it.
+    """
+    took = {} if seconds is None else {"run_seconds": round(seconds, 1)}
     document = {
         "experiment": name,
         "command": f"python -m experiments.{name} --preset {preset}",
         "preset": preset,
-        "conditions": conditions(),
+        "conditions": conditions() | took,
         **result,
     }
     path = folder / f"{name}.json"
@@ -65,16 +83,31 @@ def write_result(name: str, preset: str, result: dict[str, Any], folder: Path) -
     return path
 
 
-def open_or_collect(path: Path, preset: str) -> Dataset:
-    """The data set at a path; if it is missing or not finished, it is collected first.
+def add_data(parser: argparse.ArgumentParser) -> None:
+    """The option that names the data set, for `data_of`."""
+    parser.add_argument(
+        "--data",
+        type=Path,
+        help=f"data set; collected if it is not there (default {DATA}, for smoke a new one)",
+    )
+
+
+def data_of(options: argparse.Namespace, folder: Path) -> Dataset:
+    """The data set that the options name; if it is missing or not finished, it is collected first.
+
+    Args:
+        options: Of `add_data` and `add_places`.
+        folder: Of results, where a short run has its own.
 
     Raises:
         InputError: If there is something else, or a part of a collection of other settings.
     """
+    smoke = options.preset == "smoke"
+    path = options.data or (folder / DATA.name if smoke else DATA)
     with contextlib.suppress(InputError):
         return open_dataset(path)
-    count = SMOKE_CYCLES if preset == "smoke" else CYCLES
-    print(f"collecting {count} cycles in {path}", file=sys.stderr)
+    count = SMOKE_CYCLES if smoke else CYCLES
+    say(f"collecting {count} cycles in {path}")
     collect(path, cycles=count)
     return open_dataset(path)
 
@@ -100,17 +133,10 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
         draw: Draws the result that lies in a folder there.
     """
     needs = inspect.signature(run).parameters
-    needs_data = "data" in needs
     parser = argparse.ArgumentParser(prog=f"python -m experiments.{name}")
-    parser.add_argument("--preset", choices=PRESETS, default="full")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of results")
-    parser.add_argument("--draw", action="store_true", help="only draw what is there")
-    if needs_data:
-        parser.add_argument(
-            "--data",
-            type=Path,
-            help=f"data set; collected if it is not there (default {DATA}, for smoke a new one)",
-        )
+    add_places(parser)
+    if "data" in needs:
+        add_data(parser)
     if "models" in needs:
         parser.add_argument(
             "--models",
@@ -118,22 +144,62 @@ def main(name: str, run: Callable[..., dict[str, Any]], draw: Callable[[Path], N
             help=f"trained models; missing ones are trained (default {MODELS}, for smoke new ones)",
         )
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    if not options.draw:
-        more: dict[str, Any] = {}
-        smoke = options.preset == "smoke"
-        if "out" in needs:
-            more["out"] = options.out
-        if "rows" in needs:
-            more["rows"] = (options.out if smoke else ROWS) / f"{name}.jsonl"
-        if "models" in needs:
-            more["models"] = options.models or (options.out / MODELS.name if smoke else MODELS)
-        if needs_data:
-            path = options.data or (options.out / DATA.name if smoke else DATA)
-            try:
-                more["data"] = open_or_collect(path, options.preset)
-            except InputError as error:
-                print(f"error: {error}", file=sys.stderr)
-                raise SystemExit(2) from error
-        write_result(name, options.preset, run(options.preset, **more), options.out)
-    draw(options.out)
+    try:
+        folder = folder_of(options)
+        if options.draw:
+            redraw(name, draw, folder)
+        else:
+            _run(name, run, options, folder, set(needs))
+            say(f"{name}: drawing")
+            draw(folder)
+    except InputError as error:
+        say(f"error: {error}")
+        raise SystemExit(2) from error
+    say(f"{name}: done, see {folder}")
+
+
+def _run(
+    name: str,
+    run: Callable[..., dict[str, Any]],
+    options: argparse.Namespace,
+    folder: Path,
+    needs: set[str],
+) -> None:
+    """Gives `run` what it needs, and writes what it returns."""
+    smoke = options.preset == "smoke"
+    say(f"{name}: running, preset {options.preset}; the result goes to {folder}")
+    more: dict[str, Any] = {}
+    if "out" in needs:
+        more["out"] = folder
+    if "rows" in needs:
+        more["rows"] = (folder if smoke else ROWS) / f"{name}.jsonl"
+    if "models" in needs:
+        more["models"] = options.models or (folder / MODELS.name if smoke else MODELS)
+    if "data" in needs:
+        more["data"] = data_of(options, folder)
+    start = time.perf_counter()
+    result = run(options.preset, **more)
+    write_result(name, options.preset, result, folder, seconds=time.perf_counter() - start)
+
+
+def redraw(name: str, draw: Callable[[Path], None], folder: Path) -> None:
+    """Draws a result again, that in a folder or, if there is none, the committed one.
+
+    Args:
+        name: Of the experiment.
+        draw: Draws the result that lies in a folder there.
+        folder: Where pictures go.
+
+    Raises:
+        InputError: If neither is there.
+    """
+    places = [place for place in (folder, RESULTS) if (place / f"{name}.json").is_file()]
+    if not places:
+        raise InputError(f"There is no {name}.json in {folder} to draw: run it without --draw.")
+    say(f"{name}: drawing {places[0] / name}.json into {folder}")
+    # Drawn aside, so that nothing of the committed result lies in a folder of another run.
+    with tempfile.TemporaryDirectory() as aside:
+        shutil.copy(places[0] / f"{name}.json", aside)
+        draw(Path(aside))
+        for picture in sorted(Path(aside).glob("*.png")):
+            write_bytes_atomic(folder / picture.name, picture.read_bytes())

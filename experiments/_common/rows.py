@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from experiments._common.places import say
 from wlplan.io import write_text_atomic
 
 
@@ -31,5 +32,5 @@ class Rows:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             lines = [self._head, *(json.dumps(row) for row in self._rows.items())]
             write_text_atomic(self._path, "\n".join(lines) + "\n")
-            print(name, flush=True)
+            say(name)
         return self._rows[name]

@@ -247,7 +247,7 @@ def world_named(
 
 def planner_named(name: str) -> Any:
     """A planner by name as it is, or one that somebody else wrote."""
-    return name if name in planners.NAMES else _outside(name)
+    return name if name in planners.NAMES else planners.checked(_outside(name))
 
 
 def objective_named(name: str) -> Any:

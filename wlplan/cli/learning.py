@@ -59,7 +59,8 @@ _MOST_CYCLES = 1_000_000
         default="paper",
         show_default=True,
         help="How to choose poses and actions: as in the paper (paper), near where it dug before "
-        "(corridor), or with most actions near the last slow one (slow).",
+        "(corridor), with most actions near the last slow one (slow), or aslant from up to 1 m "
+        "before or behind the toe, near where it dug before (past-toe).",
     ),
     *site_options(),
     click.argument("parts", metavar="[--merge PART.zarr...]", nargs=-1),

@@ -27,7 +27,7 @@ from wlplan.training.settings import KINDS, Setting, setting_of
 from wlplan.worlds.names import ENGINES, FOR_PLANNING
 
 # Names that the modules behind define, repeated here to keep help fast; a test compares them.
-PROTOCOLS = ("paper", "corridor", "slow")
+PROTOCOLS = ("paper", "corridor", "slow", "past-toe")
 UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 BUNDLED = "bundled"

@@ -365,7 +365,8 @@ def simulate(
         click.echo(text)
         return
     print_plan(document)
-    say(f"{engine} {playing.text()}")
+    drawn = "" if scatter is None else f", scatter drawn from seed {scatter},"
+    say(f"{engine}{drawn} {playing.text()}")
     _print_written(folder, written)
 
 

@@ -5,7 +5,8 @@ its own, and digs it 30 times in a row; each loading starts at a random accessib
 of the pile as it then is, heads into it to within 10 degrees of the normal, and takes its action
 from a Latin hypercube. A set is one episode of each seed pile; its 180 actions are one hypercube.
 The protocol "corridor" digs on where it dug before, as plans do; "slow" takes actions like the last
-one by which the filling was slow. All else is the same.
+one by which the filling was slow; "past-toe" begins aslant, before or behind the toe. All else is
+the same.
 
 Everything random about an episode follows from the seed and its number alone, so a collection that
 was cut short continues where it stopped and ends with the same bytes. For the same reason shards,
@@ -15,7 +16,7 @@ collected apart and joined, are the data set of a single collector.
 from wlplan.dataset.collecting import collect
 from wlplan.dataset.merging import merge
 from wlplan.dataset.probes import probes_of, simulator_changes
-from wlplan.dataset.protocol import PROTOCOLS
+from wlplan.dataset.protocols import PROTOCOLS
 from wlplan.dataset.store import open_dataset
 from wlplan.dataset.variables import LOADS, VARIABLES, Dataset, fingerprint, join, reflect, split
 

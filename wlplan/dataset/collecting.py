@@ -10,7 +10,7 @@ from pathlib import Path
 
 from wlplan.dataset import store
 from wlplan.dataset.layout import Layout
-from wlplan.dataset.protocol import PROTOCOLS
+from wlplan.dataset.protocols import PROTOCOLS
 from wlplan.dataset.variables import LOADS
 from wlplan.dataset.worker_pool import CollectionSettings, collect_batches
 from wlplan.engines.simulator import Simulator

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array
 
 from wlplan.constants import CELL_SIZE
-from wlplan.dataset.protocol import Episode, grid_origin
+from wlplan.dataset.episode import Episode, grid_origin
 from wlplan.dataset.variables import Dataset
 from wlplan.engines.simulator import Simulator
 from wlplan.terrain.characteristics import as_vector, characteristics

@@ -38,7 +38,9 @@ _KINDS: dict[str, type] = {
 }
 # How a lock is signed: number and start of the process, and its host.
 _SIGNED = re.compile(r"\d+ \S+ .*")
-# A lock that is empty for longer was left by a process that died before it signed it [s].
+# And how it is when the process died as it signed it.
+_HALF_SIGNED = re.compile(r"\d+ \S*")
+# A lock that is not signed for longer was left by a process that died before it was [s].
 _SIGNING_TIME = 10.0
 
 
@@ -241,6 +243,8 @@ def lock(path: Path) -> Iterator[None]:
             holder = ""
             with contextlib.suppress(OSError):
                 holder = lock.read_text("utf-8")
+            if _HALF_SIGNED.fullmatch(holder):
+                holder = ""
             if holder and not _SIGNED.fullmatch(holder):
                 raise InputError(
                     f"{path}: {lock.name} is beside it and no lock of wlplan: choose another name."
@@ -333,11 +337,12 @@ def open_dataset(path: str | os.PathLike[str]) -> Dataset:
             array = group[name]
             if not isinstance(array, zarr.Array) or array.nchunks_initialized < array.nchunks:
                 raise ValueError(f"parts of {name} are missing")
+            # Before it is read: a few bytes may say that they are an array of any size.
+            if array.shape != (cycles, *variable.shape):
+                raise ValueError(f"{name} has shape {array.shape}")
             if not np.can_cast(array.dtype, variable.dtype, "same_kind"):
                 raise ValueError(f"{name} is of type {array.dtype}")
             columns[name] = np.asarray(array[...])
-            if columns[name].shape != (cycles, *variable.shape):
-                raise ValueError(f"{name} has shape {columns[name].shape}")
     except Exception as error:
         # Damaged chunks make the decoders raise almost anything; to the user it means the same.
         what = one_line(error)

@@ -177,37 +177,44 @@ def fingerprint(dataset: Dataset) -> str:
 
 
 def split(
-    dataset: Dataset, *, seed: int = 0, fractions: tuple[float, ...] = (0.8, 0.1, 0.1)
+    dataset: Dataset,
+    *,
+    seed: int = 0,
+    fractions: tuple[float, ...] = (0.8, 0.1, 0.1),
+    by: str = "rollout",
 ) -> tuple[Dataset, ...]:
     """Splits a data set at random into parts that share no episode, the variable `rollout`.
 
-    Cycles of one episode resemble each other: they dig the same pile. Split by cycle, a test set
-    would not show how a model does on a pile that it has not seen.
+    Cycles of one episode resemble each other: they dig the same pile. Split by cycle, as in the
+    paper, a test set does not show how a model does on a pile that it has not seen.
 
     Args:
         dataset: Data set to split.
         seed: Seed of the choice.
         fractions: Size of each part over their sum; by default training, validation and test.
+        by: What the parts do not share: "rollout", or "cycle", each of which goes where it likes.
 
     Raises:
-        InputError: If there are fewer episodes than parts.
+        InputError: If there are fewer episodes, or cycles, than parts, or it is to be split by
+            anything else.
     """
+    if by not in ("rollout", "cycle"):
+        raise InputError(f"Unknown split by {by!r}: choose one of rollout, cycle.")
     if not fractions or min(fractions) <= 0.0 or not math.isfinite(sum(fractions)):
         raise InputError(f"The fractions of the split are {fractions}: they have to be positive.")
-    episodes = np.unique(dataset.rollout)
+    belongs = dataset.rollout if by == "rollout" else np.arange(len(dataset))
+    units = np.unique(belongs)
     parts = len(fractions)
-    if len(episodes) < parts:
+    if len(units) < parts:
         raise InputError(
-            f"The data set has {len(episodes)} rollouts, too few for {parts} parts that share "
-            f"none: collect at least {parts * LOADS} cycles."
+            f"The data set has {len(units)} {by}s, too few for {parts} parts that share none: "
+            f"collect at least {parts * LOADS} cycles."
         )
-    order = np.random.default_rng(seed).permutation(episodes)
-    # Each part has one episode for a start, the rest is shared out by the fractions.
-    share = np.cumsum(fractions) / sum(fractions) * (len(episodes) - parts)
+    order = np.random.default_rng(seed).permutation(units)
+    # Each part has one of them for a start, the rest is shared out by the fractions.
+    share = np.cumsum(fractions) / sum(fractions) * (len(units) - parts)
     ends = np.rint(share).astype(int) + np.arange(1, parts + 1)
-    return tuple(
-        dataset.select(np.isin(dataset.rollout, chosen)) for chosen in np.split(order, ends[:-1])
-    )
+    return tuple(dataset.select(np.isin(belongs, chosen)) for chosen in np.split(order, ends[:-1]))
 
 
 def h36_after(

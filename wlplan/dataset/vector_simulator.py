@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from wlplan.constants import CELL_SIZE, J_PER_KJ
-from wlplan.dataset.protocol import Episode
+from wlplan.dataset.episode import Episode
 from wlplan.engines.simulator import Simulator
 from wlplan.engines.simulator.cycle import State, advance, begin, outcome
 from wlplan.engines.simulator.lane import begin_in_lane, go_on, lane_of
@@ -184,12 +184,14 @@ def _enter(
 ) -> tuple[_States, Float[Array, "52 52"], Float[Array, "52 52"]]:
     """The slots with a new loading in one of them, its surface, and the soil in its lane.
 
-    Both in the local frame.
+    Both in the local frame. Of a lane that is taken as free there is nothing to be known.
     """
     pile, dig_pose = Pile(height, CELL_SIZE, origin), Pose(*pose)
     view, _ = simulator.view(pile, dig_pose)
-    lane, is_met = lane_of(pile, dig_pose, simulator.machine)
     one = Action(*(part[None] for part in action))
+    if not simulator.lane_soil:
+        return _put(states, slot, _begin(simulator, view[..., None], one)), view, view
+    lane, is_met = lane_of(pile, dig_pose, simulator.machine)
     begun = lax.cond(
         is_met,
         lambda: begin_in_lane(lane[..., None], is_met[None], one, simulator.machine),
@@ -230,7 +232,9 @@ def _leave(
     """The surface after the loading of one slot, the local maps, and the numbers of `_named`."""
     one = _unpack(simulator, tuple(part[..., slot][..., None] for part in states))
     cycles = outcome(one, machine=simulator.machine, soil=simulator.soil)
-    cycle = jax.tree.map(lambda part: part[..., 0], cycles).replace(lane_change=lane)
+    cycle = jax.tree.map(lambda part: part[..., 0], cycles)
+    if simulator.lane_soil:
+        cycle = cycle.replace(lane_change=lane)
     pile, dig_pose = Pile(height, CELL_SIZE, origin), Pose(*pose)
     after, performance, _ = simulator.leave(pile, dig_pose, view, cycle)
 

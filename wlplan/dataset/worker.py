@@ -18,7 +18,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from wlplan.dataset.protocol import Episode
+from wlplan.dataset.episode import Episode
 from wlplan.dataset.vector_simulator import VectorSimulator
 from wlplan.engines.simulator import Simulator
 from wlplan.engines.simulator.cycle import Settings

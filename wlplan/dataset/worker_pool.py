@@ -43,7 +43,7 @@ class CollectionSettings:
         seed: Seed of piles, poses and actions.
         loads: Loadings to simulate of each episode.
         length: Loadings of a whole episode.
-        protocol: One of `wlplan.dataset.protocol.PROTOCOLS`.
+        protocol: One of `wlplan.dataset.protocols.PROTOCOLS`.
     """
 
     simulator: Simulator

@@ -47,6 +47,10 @@ _FIELDS = {
     **dict.fromkeys(("dataset", "training", "versions", "held_out"), dict),
 }
 
+# Most hidden layers of a network, most units of each, and most members of an ensemble: a network is
+# built before its weights are read, and a description may name any number.
+_MOST_LAYERS, _MOST_UNITS, _MOST_MEMBERS = 64, 1 << 16, 1000
+
 
 class _Kind(NamedTuple):
     """What belongs to a kind of model. Its name is what is saved; those of the classes are not."""
@@ -103,7 +107,12 @@ def architecture(network: Any) -> dict[str, Any]:
 
 
 def _network(kind: str, record: Mapping[str, Any]) -> Any:
-    arguments = {**record, "hidden": tuple(record["hidden"])}
+    hidden = record["hidden"]
+    if len(hidden) > _MOST_LAYERS or not all(
+        type(units) is int and 0 < units <= _MOST_UNITS for units in hidden
+    ):
+        raise ValueError(f"its hidden layers are {hidden}")
+    arguments = {**record, "hidden": tuple(hidden)}
     # The record of the ψ_low that ships says that it is standardised, as all are.
     arguments.pop("standardised", None)
     return _KINDS[kind].network(rngs=nnx.Rngs(0), **arguments)
@@ -207,7 +216,7 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
     try:
         shape = description["architecture"]
         graph, params = nnx.split(nnx.eval_shape(lambda: _network(kind, shape)))
-        members, factor = _ensemble_of_dict(description.get("ensemble"))
+        members, calibration = _ensemble_of_dict(description.get("ensemble"))
         if members:
             params = jax.tree.map(
                 lambda leaf: jax.ShapeDtypeStruct((members, *leaf.shape), leaf.dtype), params
@@ -237,7 +246,7 @@ def load_model(directory: str | os.PathLike[str], kind: str = "psi_low") -> Mode
         raise InputError(f"{directory}: is damaged ({what}): copy or train it again.") from error
     nnx.replace_by_pure_dict(params, jax.tree.map(on_device, weights))
     model = _KINDS[kind].model(params=params, graph=graph, **normalisers)
-    return Ensemble(model, factor) if members else model
+    return Ensemble(model, **calibration) if members else model
 
 
 def read_description(
@@ -316,17 +325,29 @@ def _normaliser_of_dict(record: Mapping[str, Any], size: int) -> Normaliser:
 
 
 def _ensemble_to_dict(ensemble: Ensemble) -> dict[str, Any]:
-    return {"members": ensemble.size, "factor": np.asarray(ensemble.factor).tolist()}
+    return {
+        "members": ensemble.size,
+        "factor": np.asarray(ensemble.factor).tolist(),
+        "bias": np.asarray(ensemble.bias).tolist(),
+    }
 
 
-def _ensemble_of_dict(record: Mapping[str, Any] | None) -> tuple[int, jax.Array]:
-    """Number of members, 0 of a model that is no ensemble, and their factors."""
+def _ensemble_of_dict(record: Mapping[str, Any] | None) -> tuple[int, dict[str, jax.Array]]:
+    """Number of members, 0 of a model that is no ensemble, and how they are calibrated."""
     if record is None:
-        return 0, on_device(np.ones(3, np.float32))
+        return 0, {}
     factor = np.array(record["factor"], np.float32)
-    if record["members"] < 2 or factor.shape != (3,) or not (factor > 0.0).all():
+    # Models of before had none.
+    bias = np.array(record.get("bias", np.zeros(3)), np.float32)
+    if (
+        not 2 <= record["members"] <= _MOST_MEMBERS
+        or factor.shape != (3,)
+        or not (factor > 0.0).all()
+    ):
         raise ValueError("the record of the ensemble makes no sense")
-    return int(record["members"]), on_device(factor)
+    if bias.shape != (3,) or not np.isfinite(bias).all():
+        raise ValueError("the bias of the ensemble makes no sense")
+    return int(record["members"]), {"factor": on_device(factor), "bias": on_device(bias)}
 
 
 def _of_grid(record: Any) -> str:

@@ -216,12 +216,7 @@ def planner_of(planner: str | Planner, world: World) -> Planner:
         kind: Callable[[], Planner] = getattr(planners, planners.class_name(planner))
         by_trial: Callable[[], Planner] = getattr(kind, "by_trial", kind)
         return by_trial() if is_differentiable(world) is False else kind()
-    if isinstance(planner, type) or not callable(getattr(planner, "propose", None)):
-        raise InputError(
-            f"{planner!r} is no planner: give a name, or an object with "
-            f"propose(job, loads, *, seed, progress), such as wlplan.planners.Greedy()."
-        )
-    return planner
+    return planners.checked(planner)
 
 
 def choose(

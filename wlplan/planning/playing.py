@@ -315,7 +315,9 @@ def compile_ahead(job: Job, worlds: Sequence[World]) -> None:
 
     def play() -> None:
         for world in worlds:
-            play_by_load(job.replace(world=world, referee=None), one)
+            # An engine outside of XLA has nothing to compile: it would play, for minutes.
+            if not hasattr(world, "play_load"):
+                play_by_load(job.replace(world=world, referee=None), one)
 
     if jax.default_backend() == "cpu":
         _ahead.run(play)

@@ -76,7 +76,7 @@ def frame_recorded(document: Mapping[str, Any]) -> Frame:
     if (
         not isinstance(offset, list)
         or len(offset) != 3
-        or not all(isinstance(v, int | float) and abs(v) < 1e9 for v in offset)
+        or not all(type(v) in (int, float) and abs(v) < 1e9 for v in offset)
         or not (crs is None or isinstance(crs, str))
     ):
         raise InputError(

@@ -116,11 +116,18 @@ def _tops(
         return np.zeros(known.shape, bool)
     reach = math.ceil(_TALLEST / rise)
     finite = np.isfinite(known)
-    tops: np.ndarray = finite & (known - lower_envelope(known, rise, reach) > _HIGH)
+
+    def high(rise: float) -> Bool[np.ndarray, "nx ny"]:
+        # Where nothing is seen, as far as the envelope reaches, that is infinite too.
+        low = np.where(finite, lower_envelope(known, rise, reach), 0.0)
+        over: np.ndarray = np.where(finite, known, 0.0) - low > _HIGH
+        return over
+
+    tops = high(rise)
     if not tops.any():
         return tops
     edge_rise = math.tan(math.radians(_EDGE)) * cell_size
-    edges: np.ndarray = finite & (known - lower_envelope(known, edge_rise, reach) > _HIGH)
+    edges = high(edge_rise)
     cells = 2 * round(_BEHIND / cell_size) + 1
     level = ndimage.grey_dilation(np.where(edges, known, -np.inf), size=(cells, cells))
     # Where no edge is near, the cells are too coarse for one.

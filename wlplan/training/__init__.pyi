@@ -9,6 +9,9 @@ from .pile_state import PileStateErrors as PileStateErrors
 from .pile_state import evaluate_pile_state as evaluate_pile_state
 from .settings import KINDS as KINDS
 from .settings import LOSSES as LOSSES
+from .settings import OPTIMISERS as OPTIMISERS
+from .settings import SCALINGS as SCALINGS
+from .settings import SPLITS as SPLITS
 from .settings import PhiSettings as PhiSettings
 from .settings import PhiVaeSettings as PhiVaeSettings
 from .settings import PsiHighSettings as PsiHighSettings

@@ -85,7 +85,8 @@ def held_out(dataset: Dataset, description: Mapping[str, Any]) -> Dataset:
     fractions = description.get("training", {}).get("fractions", ())
     if len(fractions) != 3 or not all(isinstance(one, float) for one in fractions):
         raise InputError("the model does not say what it was trained on: copy or train it again.")
-    return split(dataset, fractions=tuple(fractions))[2]
+    by = description["training"].get("settings", {}).get("split", "rollout")
+    return split(dataset, fractions=tuple(fractions), by=by)[2]
 
 
 def shares_piles(dataset: Dataset, description: Mapping[str, Any]) -> bool:
@@ -156,6 +157,24 @@ def _interval(error: Float[np.ndarray, " n"], deviation: Float[np.ndarray, " n"]
         sizes(deviation),
         sizes(error),
     )
+
+
+def shortfall(ensemble: Ensemble, dataset: Dataset) -> Float[Array, "3"]:
+    """What an ensemble has to add to each prediction, in deviations, for its sums to come out.
+
+    That of the mass is zero: of a bucket that comes out empty nothing can be taken.
+
+    Args:
+        ensemble: Ensemble without a bias, whose own factors are one.
+        dataset: Cycles that its members were not trained on.
+    """
+    predicted, deviation = predict_with_deviation(ensemble, dataset)
+    assert deviation is not None
+    bias = {}
+    for name in QUANTITIES:
+        short = getattr(dataset, name).astype(np.float64) - np.asarray(getattr(predicted, name))
+        bias[name] = short.sum() / np.asarray(getattr(deviation, name), np.float64).sum()
+    return jnp.asarray(np.array([0.0, bias["time"], bias["work"]], np.float32))
 
 
 def widening(ensemble: Ensemble, dataset: Dataset) -> Float[Array, "3"]:

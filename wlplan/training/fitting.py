@@ -1,4 +1,4 @@
-"""Fitting a network to examples: epochs of AdamW, the best weights kept, resumable."""
+"""Fitting a network to examples: epochs of descent, the best weights kept, resumable."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from wlplan.training.settings import Settings
 from wlplan.types import PyTree
 
 # Part of the steps over which the learning rate rises before its cosine decay. Our choice; the
-# paper uses Adam at a constant 1e-5 for up to 2,000 epochs.
+# paper uses Adam at a constant 1e-5 for up to 2,000 epochs, which takes up to thirty times as long.
 _WARM_UP = 0.05
-# Gradients of more than this norm are scaled down to it.
+# Gradients of more than this norm are scaled down to it before AdamW.
 _LARGEST_GRADIENT = 1.0
 # Examples of the validation part at a time, which bounds the memory.
 _CHUNK = 256
@@ -37,8 +37,8 @@ _ENOUGH = 20_000
 # Least time between two saved states [s].
 _SAVE_EVERY = 30.0
 
-OPTIMISER = "AdamW, cosine schedule"
-"""The optimiser, as `model.json` names it."""
+OPTIMISER_NAMES = {"adamw": "AdamW, cosine schedule", "adam": "Adam, constant rate"}
+"""The optimisers, as `model.json` names them, by what the settings call them."""
 
 # Error from which on the size counts, in units of the spread. With a fifth ψ_high errs by a tenth
 # more.
@@ -141,9 +141,11 @@ def even_sample(table: Mapping[str, Any]) -> dict[str, Array]:
     return {name: jnp.asarray(values[::stride]) for name, values in table.items()}
 
 
-def mirror_some(key: Array, maps: Float[Array, "n i j"]) -> tuple[Array, Bool[Array, " n"]]:
-    """Maps of which about half are mirrored, left for right, and which ones."""
-    mirrored = jax.random.bernoulli(key, 0.5, (len(maps),))
+def mirror_some(
+    key: Array, maps: Float[Array, "n i j"], part: float = 0.5
+) -> tuple[Array, Bool[Array, " n"]]:
+    """Maps of which about a part is mirrored, left for right, and which ones."""
+    mirrored = jax.random.bernoulli(key, part, (len(maps),))
     return jnp.where(mirrored[:, None, None], maps[:, :, ::-1], maps), mirrored
 
 
@@ -187,14 +189,7 @@ def fit_network(
     graph = parts[0][0]
     count = len(jax.tree.leaves(train)[0])
     batch = min(settings.batch, count)
-    steps = settings.epochs * (count // batch)
-    rate = optax.warmup_cosine_decay_schedule(
-        0.0, settings.learning_rate, int(_WARM_UP * steps), max(steps, 1)
-    )
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(_LARGEST_GRADIENT),
-        optax.adamw(rate, weight_decay=settings.weight_decay),
-    )
+    optimiser = _optimiser(settings, settings.epochs * (count // batch))
     run_epoch: Any = partial(_epoch, graph, loss, optimiser, batch, augment)
 
     def start(params: Any, rest: Any) -> Fit:
@@ -213,11 +208,12 @@ def fit_network(
     done = 0
     if state is not None and (found := state.load(fit)) is not None:
         fit, done, losses = found
-    while done < settings.epochs:
+    while done < settings.epochs and not _is_converged(fit, done, settings.patience):
         fit, losses = run_epoch(fit, keys, jnp.asarray(done), train, validation)
         done += 1
         if state is not None:
-            state.save(fit, done, losses, now=done == settings.epochs)
+            over = done == settings.epochs or _is_converged(fit, done, settings.patience)
+            state.save(fit, done, losses, now=over)
         if progress is not None:
             jax.block_until_ready(losses)
             progress(done, settings.epochs)
@@ -226,6 +222,8 @@ def fit_network(
     record = {
         # At most the examples there are.
         "batch": batch,
+        # Fewer than the settings have where patience ended it.
+        "epochs": done,
         # Numbers, or lists of them: one for each member.
         "best_epoch": (np.asarray(fit.best_epoch) + 1).tolist(),
         "best_validation_loss": np.asarray(fit.best_loss, float).tolist(),
@@ -233,6 +231,24 @@ def fit_network(
         "last_validation_loss": np.asarray(losses[..., 1], float).tolist(),
     }
     return nnx.merge_state(*fit.best), record
+
+
+def _optimiser(settings: Settings, steps: int) -> optax.GradientTransformation:
+    """The optimiser of a training of so many steps."""
+    if settings.optimiser == "adam":
+        return optax.adam(settings.learning_rate)
+    rate = optax.warmup_cosine_decay_schedule(
+        0.0, settings.learning_rate, int(_WARM_UP * steps), max(steps, 1)
+    )
+    return optax.chain(
+        optax.clip_by_global_norm(_LARGEST_GRADIENT),
+        optax.adamw(rate, weight_decay=settings.weight_decay),
+    )
+
+
+def _is_converged(fit: Fit, done: int, patience: int) -> bool:
+    """Whether the best epoch of every member lies as far back as patience goes."""
+    return patience > 0 and bool((done - 1 - np.asarray(fit.best_epoch) >= patience).all())
 
 
 def _epoch(

@@ -15,7 +15,7 @@ from wlplan.models.ensemble import Ensemble
 from wlplan.models.layers import StandardisedMlp
 from wlplan.models.normaliser import Normaliser
 from wlplan.models.performance import PerformanceModel
-from wlplan.training.evaluation import EvaluationReport, evaluate_performance, widening
+from wlplan.training.evaluation import EvaluationReport, evaluate_performance, shortfall, widening
 from wlplan.training.fitting import loss_of_errors
 from wlplan.training.trainer import Trainer
 
@@ -92,6 +92,7 @@ def finished(
         InputError: If it cannot be evaluated or saved.
     """
     if members > 1:
-        unfitted = Ensemble(model, factor=jnp.ones(3))
-        model = unfitted.replace(factor=widening(unfitted, trainer.validation))
+        ensemble = Ensemble(model, factor=jnp.ones(3), bias=jnp.zeros(3))
+        ensemble = ensemble.replace(bias=shortfall(ensemble, trainer.validation))
+        model = ensemble.replace(factor=widening(ensemble, trainer.validation))
     return model, trainer.finish(model, evaluate_performance)

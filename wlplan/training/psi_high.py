@@ -35,10 +35,10 @@ def train(
 ) -> tuple[PerformanceModel | Ensemble, EvaluationReport]:
     """Trains ψ_high, see `wlplan.training.train`.
 
-    Half of the maps of a step, chosen anew each time, are mirrored: what a loading yields does not
+    A part of the maps of a step, chosen anew each time, is mirrored: what a loading yields does not
     depend on left and right.
     """
-    trainer = Trainer(dataset, out, settings, _tables)
+    trainer = Trainer(dataset, out, settings, _tables, by=settings.split, samples=settings.samples)
     normalisers, examples = normalised_examples(trainer)
 
     def start(seed: int) -> PsiHigh:
@@ -50,7 +50,8 @@ def train(
             scattered=settings.members > 1,
             rngs=nnx.Rngs(seed),
         )
-        network.fit_scales(**even_sample(examples[0]))
+        if settings.scaling == "spread":
+            network.fit_scales(**even_sample(examples[0]))
         return network
 
     def loss(network: PsiHigh, e: PyTree, rngs: nnx.Rngs | None) -> Array:
@@ -62,7 +63,7 @@ def train(
         networks,
         loss,
         examples,
-        augment=lambda key, e: {**e, "maps": mirror_some(key, e["maps"])[0]},
+        augment=lambda key, e: {**e, "maps": mirror_some(key, e["maps"], settings.mirrored)[0]},
         progress=progress,
     )
     model = HighPerformanceModel(params=best, graph=nnx.graphdef(networks[0]), **normalisers)

@@ -33,7 +33,9 @@ def train(
     progress: Progress | None,
 ) -> tuple[PerformanceModel | Ensemble, EvaluationReport]:
     """Trains ψ_low, see `wlplan.training.train`."""
-    trainer = Trainer(dataset, out, settings, performance_tables)
+    trainer = Trainer(
+        dataset, out, settings, performance_tables, by=settings.split, samples=settings.samples
+    )
     normalisers, examples = normalised_examples(trainer)
 
     def start(seed: int) -> PsiLow:
@@ -44,8 +46,9 @@ def train(
             scattered=settings.members > 1,
             rngs=nnx.Rngs(seed),
         )
-        network.scale_in.fit(examples[0]["inputs"])
-        network.scale_out.fit(examples[0]["outputs"])
+        if settings.scaling == "spread":
+            network.scale_in.fit(examples[0]["inputs"])
+            network.scale_out.fit(examples[0]["outputs"])
         return network
 
     def loss(network: PsiLow, e: PyTree, rngs: nnx.Rngs | None) -> Array:

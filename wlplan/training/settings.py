@@ -22,6 +22,21 @@ longer than the rest. They weigh so much by the square that all others suffer: Ï
 in time; by Huber's loss 3.1 %.
 """
 
+OPTIMISERS = ("adamw", "adam")
+"""AdamW, its rate rising and then falling as a cosine to nothing; or Adam at a constant rate,
+without weight decay, as in the paper.
+"""
+
+SPLITS = ("rollout", "cycle")
+"""What a held-out part does not share with the others: the piles, or only the cycles, as in the
+paper. Split by cycle, the loadings before and after one that is held out are trained on.
+"""
+
+SCALINGS = ("spread", "min-max")
+"""What a network works in: units of the spread of the training data, or of their range, as in the
+paper.
+"""
+
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
@@ -88,7 +103,7 @@ def _dropout(default: float) -> Any:
 
 
 def _learning_rate(default: float) -> Any:
-    return _setting(default, "Learning rate at its peak.", above=0.0)
+    return _setting(default, "Learning rate, of adamw at its peak.", above=0.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -110,7 +125,17 @@ class Settings:
     hidden: tuple[int, ...] = _hidden((512, 512))
     dropout: float = _dropout(0.1)
     learning_rate: float = _learning_rate(2e-3)
-    weight_decay: float = _setting(1e-2, "Weight decay of AdamW.", least=0.0)
+    weight_decay: float = _setting(1e-2, "Weight decay of adamw.", least=0.0)
+    optimiser: str = _setting(
+        "adamw",
+        "AdamW with a cosine schedule, or Adam at a constant rate, which is the paper's.",
+        choices=OPTIMISERS,
+    )
+    patience: int = _setting(
+        0,
+        "Epochs without a smaller validation loss after which the training ends; 0: it never does.",
+        least=0,
+    )
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -151,6 +176,23 @@ class PerformanceSettings(Settings):
     loss: str = _setting(
         "huber", "How errors count in the loss; squared is the paper's.", choices=LOSSES
     )
+    split: str = _setting(
+        "rollout",
+        "What held-out cycles do not share with the others: a pile, or nothing, which is the "
+        "paper's.",
+        choices=SPLITS,
+    )
+    scaling: str = _setting(
+        "spread",
+        "Units that the network works in: spreads, or ranges, which is the paper's.",
+        choices=SCALINGS,
+    )
+    samples: int = _setting(
+        0,
+        "Cycles of each data set to train and validate on, drawn at random; 0: all that are not "
+        "held out.",
+        least=0,
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -173,6 +215,20 @@ class PsiHighSettings(PerformanceSettings):
         "Encoder of the map: the paper's convolutions, or principal components.",
         choices=ENCODERS,
     )
+    mirrored: float = _setting(
+        0.5,
+        "Part of the maps of a step that are mirrored, left for right; the paper has none.",
+        least=0.0,
+        most=1.0,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.encoder == "principal" and self.scaling == "min-max":
+            raise InputError(
+                "Principal components have no range of their own: with the scaling min-max the "
+                "encoder has to be convolutional."
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -18,13 +18,13 @@ from wlplan.dataset import Dataset, fingerprint, join, probes_of, split
 from wlplan.errors import InputError
 from wlplan.io.provenance import versions
 from wlplan.models.storage import Model, check_target, save_model
-from wlplan.training.fitting import OPTIMISER, Loss, SavedState, fit_network
+from wlplan.training.fitting import OPTIMISER_NAMES, Loss, SavedState, fit_network
 from wlplan.training.settings import Settings
 from wlplan.types import PyTree
 
-# Training, validation and test. Paper, section 6.4: 10,718 cycles, 1,072 of them for the test,
-# 10 % of the rest for validation.
-_FRACTIONS = (0.8, 0.1, 0.1)
+# Training, validation and test, by what the split is by. Paper, section 6.4.1: 10,718 cycles, 1,072
+# of them for the test, 10 % of the rest for validation.
+_FRACTIONS = {"rollout": (0.8, 0.1, 0.1), "cycle": (0.81, 0.09, 0.1)}
 
 
 @runtime_checkable
@@ -52,10 +52,10 @@ def train(
 ) -> tuple[Any, Report]:
     """Trains a model on a data set and saves it.
 
-    The data set is split by rollout, alike for all seeds, so that errors can be compared. Of all
-    epochs the weights with the least loss on the validation part are kept; the report is on the
-    test part, which plays no role in training. If killed, the same call continues where it was and
-    ends with the same weights.
+    The data set is split by rollout, or as the settings say, alike for all seeds, so that errors
+    can be compared. Of all epochs the weights with the least loss on the validation part are kept;
+    the report is on the test part, which plays no role in training. If killed, the same call
+    continues where it was and ends with the same weights.
 
     Args:
         settings: What is trained, and how: `PsiLowSettings`, `PsiHighSettings`, `PhiSettings` or
@@ -80,14 +80,16 @@ def train(
 class Trainer:
     """A training from its data set to the saved model.
 
-    The data set is split by rollout, without the cycles that are not valid. A training that was
-    killed continues where it was when asked for again, and ends with the same weights.
+    The data set is split without the cycles that are not valid. A training that was killed
+    continues where it was when asked for again, and ends with the same weights.
 
     Args:
         dataset: Loading cycles, of one or several data sets; each is split by itself.
         out: Directory to save to; an older model there is replaced. None: nothing is saved.
         settings: How it is trained.
         tables: Arrays of a part of the data that the training looks at.
+        by: What the parts do not share, one of `SPLITS`.
+        samples: Cycles of each data set for training and validation, drawn at random; 0: all.
 
     Attributes:
         cycles: Number of cycles of the training, the validation and the test part.
@@ -106,17 +108,24 @@ class Trainer:
         out: str | os.PathLike[str] | None,
         settings: Settings,
         tables: Callable[[Dataset], Mapping[str, np.ndarray]],
+        *,
+        by: str = "rollout",
+        samples: int = 0,
     ):
         self._out = None if out is None else Path(out)
         if self._out is not None:
             check_target(self._out)
         datasets = [dataset] if isinstance(dataset, Dataset) else list(dataset)
+        self._fractions = _FRACTIONS[by]
         # Of the training parts only the tables are kept, which are a fraction of it.
         rows: list[list[Mapping[str, np.ndarray]]] = []
         self.cycles = [0, 0, 0]
         used = []
         for each in datasets:
-            parts = [part.select(part.valid) for part in split(each, fractions=_FRACTIONS)]
+            every = split(each, fractions=self._fractions, by=by)
+            parts = [part.select(part.valid) for part in every]
+            if samples:
+                parts[:2] = self._drawn(parts[:2], samples, settings.seed)
             arrays = [tables(part) for part in parts]
             if not all(np.isfinite(v).all() for table in arrays for v in table.values()):
                 raise InputError(
@@ -196,9 +205,9 @@ class Trainer:
             records = self._records.get("", self._records)
             training = {
                 "settings": self._settings.as_dict(),
-                "optimiser": OPTIMISER,
+                "optimiser": OPTIMISER_NAMES[self._settings.optimiser],
                 **records,
-                "fractions": _FRACTIONS,
+                "fractions": self._fractions,
                 "cycles": self.cycles,
             }
             save_model(
@@ -210,16 +219,26 @@ class Trainer:
                 state.remove()
         return report
 
+    def _drawn(self, parts: Sequence[Dataset], samples: int, seed: int) -> list[Dataset]:
+        """So many cycles of training and validation part together, in the proportion of both."""
+        known = self._fractions[0] + self._fractions[1]
+        draw = np.random.default_rng([seed, samples])
+        drawn = []
+        for part, fraction in zip(parts, self._fractions, strict=False):
+            count = min(max(round(samples * fraction / known), 1), len(part))
+            drawn.append(part.select(np.sort(draw.choice(len(part), count, replace=False))))
+        return drawn
+
     def _state_of(self, stage: str) -> SavedState | None:
         """Where the fit of a stage is kept, under everything that its result follows from."""
         if self._out is None:
             return None
         identity = {
             "dataset": self._data["fingerprints"],
-            "fractions": _FRACTIONS,
+            "fractions": self._fractions,
             "kind": self._settings.kind,
             "settings": self._settings.as_dict(),
-            "optimiser": OPTIMISER,
+            "optimiser": OPTIMISER_NAMES[self._settings.optimiser],
             "stage": stage,
             "versions": versions(),
         }

@@ -40,6 +40,7 @@ _DATA = (
     _Part("-more", "paper", 54_000),
     _Part("-corridor-more", "corridor", 54_000),
     _Part("-slow", "slow", 32_400),
+    _Part("-past-toe", "past-toe", 54_000),
 )
 
 # With so many cycles no unit has to be dropped, and ψ_high is as good with three layers of 256
@@ -47,7 +48,7 @@ _DATA = (
 SHIPPED: tuple[Settings, ...] = (
     PsiLowSettings(members=5, hidden=(128,) * 3, dropout=0.0, epochs=40, batch=256),
     PsiHighSettings(members=5, hidden=(256,) * 3, dropout=0.0, epochs=60, batch=256),
-    PhiSettings(hidden=(512,) * 3, dropout=0.0, epochs=40, batch=256),
+    PhiSettings(hidden=(448,) * 3, dropout=0.0, epochs=40, batch=256),
     StallSettings(hidden=(128,) * 3, dropout=0.0, epochs=24, batch=256),
 )
 """How the models that ship are trained, apart from the seed."""

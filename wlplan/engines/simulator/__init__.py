@@ -2,7 +2,17 @@
 
 from wlplan.engines.limits import STOP_REASONS
 from wlplan.engines.simulator.cycle import Cycle, Settings, dig
-from wlplan.engines.simulator.trajectory import Trajectory, trace
+from wlplan.engines.simulator.trajectory import Section, Trajectory, trace, trace_section
 from wlplan.engines.simulator.world import Simulator
 
-__all__ = ["STOP_REASONS", "Cycle", "Settings", "Simulator", "Trajectory", "dig", "trace"]
+__all__ = [
+    "STOP_REASONS",
+    "Cycle",
+    "Section",
+    "Settings",
+    "Simulator",
+    "Trajectory",
+    "dig",
+    "trace",
+    "trace_section",
+]

@@ -7,7 +7,7 @@ that outcomes are continuous in the inputs.
 
 Cycles are computed side by side, the last axis of every array: `begin` some, `advance` them by a
 few steps at a time, and take each one's `outcome` when it `has_ended`. `dig` does it all for one,
-and `lane.dig_from_lane` for one with the lane.
+and `lane.dig_through_lane` for one with the lane.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import no_type_check
+from collections.abc import Callable
+from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +37,14 @@ class Trajectory(struct.PyTreeNode):
     phase: Int[Array, " steps"]  # 0 approaching and filling, 1 stopped, 2 ended
 
 
+@no_type_check
+class Section(struct.PyTreeNode):
+    """What the vertical plane of the heading cuts of soil and bucket at the same moments."""
+
+    surface: Float[Array, "steps 52"]  # of the soil, along the heading of the local frame [m]
+    content: Float[Array, " steps"]  # soil in the bucket there [m^2]
+
+
 def trace(
     height: Float[Array, "52 52"],
     ground: Float[Array, "52 52"],
@@ -59,18 +68,64 @@ def trace(
         `settings.max_steps` + 1 moments; the last has all cycles at their end.
     """
 
-    def play(height: Array, ground: Array, action: Action) -> Trajectory:
-        def step(state: State, _: None) -> tuple[State, Trajectory]:
+    def moment(state: State) -> Trajectory:
+        return _moment(state, machine, soil)
+
+    path: Trajectory = _recorded(moment, height, ground, action, machine, soil, settings)
+    return path
+
+
+def trace_section(
+    height: Float[Array, "52 52"],
+    ground: Float[Array, "52 52"],
+    action: Action,
+    *,
+    machine: WheelLoader = WA320,
+    soil: Soil = GRAVEL,
+    settings: Settings = _SETTINGS,
+) -> tuple[Trajectory, Section]:
+    """The trajectory of `trace`, and beside it where the soil is by then.
+
+    Args:
+        height: As for `trace`.
+        ground: As for `trace`.
+        action: As for `trace`.
+        machine: As for `trace`.
+        soil: As for `trace`.
+        settings: As for `trace`.
+    """
+
+    def moment(state: State) -> tuple[Trajectory, Section]:
+        return _moment(state, machine, soil), _section(state, machine)
+
+    both: tuple[Trajectory, Section] = _recorded(
+        moment, height, ground, action, machine, soil, settings
+    )
+    return both
+
+
+def _recorded(
+    moment: Callable[[State], Any],
+    height: Float[Array, "52 52"],
+    ground: Float[Array, "52 52"],
+    action: Action,
+    machine: WheelLoader,
+    soil: Soil,
+    settings: Settings,
+) -> Any:
+    """What `moment` takes from the state at the start of every time step of one cycle."""
+
+    def play(height: Array, ground: Array, action: Action) -> Any:
+        def step(state: State, _: None) -> tuple[State, Any]:
             # Does nothing once all cycles have ended.
             after = advance(state, machine=machine, soil=soil, settings=settings, steps=1)
-            return after, _moment(state, machine, soil)
+            return after, moment(state)
 
         state = begin(height, ground, action, machine)
         return lax.scan(step, state, None, length=settings.max_steps + 1)[1]
 
     one = jax.tree.map(lambda part: jnp.asarray(part)[..., None], (height, ground, action))
-    path: Trajectory = jax.tree.map(lambda part: part[..., 0], side_by_side(play)(*one))
-    return path
+    return jax.tree.map(lambda part: part[..., 0], side_by_side(play)(*one))
 
 
 def _moment(state: State, machine: WheelLoader, soil: Soil) -> Trajectory:
@@ -85,4 +140,17 @@ def _moment(state: State, machine: WheelLoader, soil: Soil) -> Trajectory:
         speed=state.speed,
         mass=terrain.total(state.fill) * soil.density,
         phase=state.phase,
+    )
+
+
+def _section(state: State, machine: WheelLoader) -> Section:
+    """The middle of the same cycles: no column lies on the centre line, so those beside it."""
+    columns = state.height.shape[1]
+    middle = state.height[1:-1, columns // 2 - 1 : columns // 2 + 1]
+    lanes = terrain.Lanes(machine)
+    width = jnp.asarray(lanes.width, state.fill.dtype)
+    inner = slice(lanes.count // 2 - 1, lanes.count // 2 + 1)
+    return Section(
+        surface=middle.mean(axis=1),
+        content=(state.fill[inner] / jnp.broadcast_to(width, state.fill.shape)[inner]).mean(axis=0),
     )

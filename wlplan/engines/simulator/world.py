@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,8 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
 
-from wlplan.constants import J_PER_KJ, KG_PER_TONNE
-from wlplan.engines.simulator.cycle import Cycle, Settings
+from wlplan.constants import CELL_SIZE, J_PER_KJ, KG_PER_TONNE
+from wlplan.engines.simulator.cycle import Cycle, Settings, dig
 from wlplan.engines.simulator.lane import behind, dig_through_lane, lane_of
 from wlplan.site.machine import WA320, WheelLoader
 from wlplan.site.soil import GRAVEL, Soil
@@ -41,6 +41,8 @@ class Simulator(struct.PyTreeNode):
     soil: Soil = struct.field(pytree_node=False, default=GRAVEL)
     settings: Settings = struct.field(pytree_node=False, default=Settings())
     schedule: Schedule = struct.field(pytree_node=False, default=DEFAULT_SCHEDULE)
+    lane_soil: bool = struct.field(pytree_node=False, default=False)
+    """Whether soil that lies in the approach lane is met; otherwise the lane is taken as free."""
 
     def __call__(self, pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
         """The pile and the performance after one loading.
@@ -114,66 +116,96 @@ class Simulator(struct.PyTreeNode):
         Returns:
             The pile after, relaxed, the performance, and how the automaton ended.
         """
-        after, report = self._settled(pile, pose, cycle.height - height, cycle.lane_change)
-        return after, _performance(cycle, report.missing, self.soil), report
+        changes = _changes(height, cycle)
+        after, report = self._settled(pile, pose, changes)
+        return after, _performance(cycle, changes.taken - report.missing, self.soil), report
 
-    def _settled(
-        self,
-        pile: Pile,
-        pose: Pose,
-        change: Float[Array, "52 52"],
-        lane_change: Float[Array, "52 52"] | None,
-    ) -> tuple[Pile, SolveReport]:
-        """Writes the changes of a loading to its pile and lets it slide, first in the lane."""
+    def _settled(self, pile: Pile, pose: Pose, changes: _Changes) -> tuple[Pile, SolveReport]:
+        """The pile with what a loading changes, slid: in the lane first, where there is one."""
 
         def settle(
             surface: Array, pose: Pose, change: Array
         ) -> tuple[Array, tuple[Array, Array, Array, Array]]:
             before = pile.replace(height=surface)
-            window, start = window_of(before, pose)
-            dug, missing = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+            dug, start, missing = _written(before, pose, change)
             after = settle_dug(
                 before, dug, start, repose_angle=self.soil.repose_angle, schedule=self.schedule
             )
-            ended = after.rounds, after.at_rest, after.steepest_slope, missing
             height: Array = after.pile.height
-            return height, ended
+            return height, (after.rounds, after.at_rest, after.steepest_slope, missing)
 
-        if lane_change is None:
-            height, ended = settle(pile.height, pose, change)
+        if changes.in_lane is None:
+            height, ended = settle(pile.height, pose, changes.ahead)
             return pile.replace(height=height), SolveReport(*ended)
 
         # A loop of two, so that the automaton is compiled once.
         def turn(
             surface: Array, part: tuple[Pose, Array, Array]
         ) -> tuple[Array, tuple[Array, ...]]:
-            where, change, wanted = part
+            where, change, is_wanted = part
             nothing = jnp.zeros_like(surface[0, 0])
             rest = jnp.zeros((), jnp.int32), jnp.ones((), bool), nothing, nothing
             after: tuple[Array, tuple[Array, ...]] = lax.cond(
-                wanted, lambda: settle(surface, where, change), lambda: (surface, rest)
+                is_wanted, lambda: settle(surface, where, change), lambda: (surface, rest)
             )
             return after
 
-        is_met = (lane_change != 0.0).any()
         poses = jax.tree.map(lambda *v: jnp.stack(v), behind(pose), pose)
-        changes = jnp.stack([lane_change, change])
-        wanted = jnp.stack([is_met, jnp.ones((), bool)])
+        both = jnp.stack([changes.in_lane, changes.ahead])
+        is_wanted = jnp.stack([(changes.in_lane != 0.0).any(), jnp.ones((), bool)])
         height, (rounds, at_rest, slope, missing) = lax.scan(
-            turn, pile.height, (poses, changes, wanted)
+            turn, pile.height, (poses, both, is_wanted)
         )
         report = SolveReport(rounds.sum(), at_rest.all(), slope[1], missing.sum())
         return pile.replace(height=height), report
 
 
-def _performance(cycle: Cycle, missing: Float[Array, ""], soil: Soil) -> Performance:
-    """What a cycle yields; the load is what left the grid.
+class _Changes(NamedTuple):
+    """What a loading changes of the surface, in the frames of its pose and of its lane."""
 
-    The loader may have dug beyond the edge of the map, or deeper than there is soil. Rounding of
-    the time stepping goes to the mass.
+    ahead: Float[Array, "52 52"]  # [m]
+    in_lane: Float[Array, "52 52"] | None  # None: the lane is taken as free [m]
+    taken: Float[Array, ""]  # what leaves both [m^3]
+
+
+def _changes(height: Float[Array, "52 52"], cycle: Cycle) -> _Changes:
+    """The changes of a cycle that dug a surface [m].
+
+    Rounding, step by step, may leave some 200 g more than was there, and no load.
+    """
+    parts = [cycle.height - height]
+    if cycle.lane_change is not None:
+        parts.append(cycle.lane_change)
+    lost = jnp.stack([jnp.maximum(-part, 0.0).sum() for part in parts]).sum()
+    gained = jnp.stack([jnp.maximum(part, 0.0).sum() for part in parts]).sum()
+    share = jnp.where(gained > lost, lost / jnp.where(gained > lost, gained, 1.0), 1.0)
+    parts = [jnp.where(part > 0.0, share * part, part) for part in parts]
+    taken = CELL_SIZE**2 * (lost - share * gained)
+    return _Changes(parts[0], parts[1] if len(parts) > 1 else None, taken)
+
+
+def _written(
+    pile: Pile, pose: Pose, change: Float[Array, "52 52"]
+) -> tuple[Float[Array, "n m"], tuple[Array, Array], Float[Array, ""]]:
+    """A change written to the part of the pile around its pose, before that slides.
+
+    Returns:
+        The part after [m]; its first cell; and what was to leave it and has not, since the loader
+        dug beyond the edge of the map or deeper than there is soil [m^3].
+    """
+    window, start = window_of(pile, pose)
+    dug, missing = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
+    return dug, start, missing
+
+
+def _performance(cycle: Cycle, left: Float[Array, ""], soil: Soil) -> Performance:
+    """What a cycle yields; the load is what left the grid [m^3].
+
+    That is not `cycle.mass`: in float32 a bucket that pushes until its time is up may count some
+    200 g too much, step by step.
     """
     work = cycle.work_drive + cycle.work_boom + cycle.work_bucket + cycle.work_slip
-    mass = jnp.maximum(cycle.mass - soil.density * missing, 0.0)
+    mass = jnp.maximum(soil.density * left, 0.0)
     return Performance(mass=mass / KG_PER_TONNE, time=cycle.time, work=work / J_PER_KJ)
 
 
@@ -181,14 +213,13 @@ def _dig(
     simulator: Simulator, pile: Pile, pose: Pose, action: Action
 ) -> tuple[Float[Array, "52 52"], Cycle]:
     height, ground = simulator.view(pile, pose)
+    machine, soil, settings = simulator.machine, simulator.soil, simulator.settings
+    if not simulator.lane_soil:
+        cycle = dig(height, ground, action, machine=machine, soil=soil, settings=settings)
+        return height, cycle
+    lane = lane_of(pile, pose, machine)
     cycle = dig_through_lane(
-        height,
-        ground,
-        lane_of(pile, pose, simulator.machine),
-        action,
-        machine=simulator.machine,
-        soil=simulator.soil,
-        settings=simulator.settings,
+        height, ground, lane, action, machine=machine, soil=soil, settings=settings
     )
     return height, cycle
 
@@ -196,24 +227,18 @@ def _dig(
 @jax.jit
 def _foresee(simulator: Simulator, pile: Pile, pose: Pose, action: Action) -> Performance:
     height, cycle = _dig(simulator, pile, pose, action)
-    change, lane_change = cycle.height - height, cycle.lane_change
-    assert lane_change is not None
-    surface, missing = lax.cond(
-        (lane_change != 0.0).any(),
-        lambda: _written(pile, behind(pose), lane_change),
-        lambda: (pile.height, jnp.zeros_like(change[0, 0])),
-    )
-    _, more = _written(pile.replace(height=surface), pose, change)
-    return _performance(cycle, missing + more, simulator.soil)
+    changes = _changes(height, cycle)
+    surface, missing = pile.height, jnp.zeros_like(changes.taken)
+    if changes.in_lane is not None:
+        in_lane = changes.in_lane
 
+        def written() -> tuple[Array, Array]:
+            dug, start, missing = _written(pile, behind(pose), in_lane)
+            return paste(pile.height, dug, jnp.stack(start)), missing
 
-def _written(
-    pile: Pile, pose: Pose, change: Float[Array, "52 52"]
-) -> tuple[Float[Array, "nx ny"], Float[Array, ""]]:
-    """A pile's surface after a change before it slides [m], and what is missing of it [m^3]."""
-    window, start = window_of(pile, pose)
-    dug, missing = add_local_change(window.height, window, pose, change, STATE_DISPLACEMENT)
-    return paste(pile.height, dug, jnp.stack(start)), missing
+        surface, missing = lax.cond((in_lane != 0.0).any(), written, lambda: (surface, missing))
+    *_, more = _written(pile.replace(height=surface), pose, changes.ahead)
+    return _performance(cycle, changes.taken - missing - more, simulator.soil)
 
 
 @jax.jit

@@ -5,8 +5,11 @@ A planner goes by the name of its file; its class has that name in capitals: `ma
 """
 
 import pkgutil
+from typing import Any
 
 import lazy_loader
+
+from wlplan.errors import InputError
 
 NAMES = tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
 """Names of the planners."""
@@ -15,6 +18,20 @@ NAMES = tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
 def class_name(name: str) -> str:
     """The class that a planner's file holds: `max_load` is `MaxLoad`."""
     return "".join(part.capitalize() for part in name.split("_"))
+
+
+def checked(value: Any) -> Any:
+    """A planner that somebody else wrote, as it is.
+
+    Raises:
+        InputError: If it is none.
+    """
+    if isinstance(value, type) or not callable(getattr(value, "propose", None)):
+        raise InputError(
+            f"{value!r} is no planner: give a name, or an object with "
+            f"propose(job, loads, *, seed, progress), such as wlplan.planners.Greedy()."
+        )
+    return value
 
 
 __getattr__, __dir__, __all__ = lazy_loader.attach(

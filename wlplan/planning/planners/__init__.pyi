@@ -1,5 +1,7 @@
 """The planners: a file each, named after its planner; one line each here for type checkers."""
 
+from wlplan.planning.proposals import Planner
+
 from .cma_es import CmaEs as CmaEs
 from .cross_entropy import CrossEntropy as CrossEntropy
 from .gradient import Gradient as Gradient
@@ -13,3 +15,4 @@ from .tree_search import TreeSearch as TreeSearch
 NAMES: tuple[str, ...]
 
 def class_name(name: str) -> str: ...
+def checked(value: object) -> Planner: ...

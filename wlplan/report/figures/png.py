@@ -13,12 +13,14 @@ from wlplan.io import write_bytes_atomic
 from wlplan.io.files import MADE_BY
 
 
-def png_bytes(figure: Figure, *, dpi: int = 150) -> bytes:
+def png_bytes(figure: Figure, *, dpi: int = 150, rare_colours: bool = False) -> bytes:
     """A figure as the content of a PNG file; the same figure gives the same bytes.
 
     Args:
         figure: What to draw; its empty borders are cut off.
         dpi: Pixels an inch.
+        rare_colours: Whether colours of few pixels matter as much as those of many, which then are
+            a little coarser.
     """
     buffer = io.BytesIO()
     figure.savefig(
@@ -30,7 +32,8 @@ def png_bytes(figure: Figure, *, dpi: int = 150) -> bytes:
         metadata={"Software": None},
     )
     # 256 colours look the same, and take a third of the room.
-    few = Image.open(buffer).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    method = Image.Quantize.MAXCOVERAGE if rare_colours else Image.Quantize.MEDIANCUT
+    few = Image.open(buffer).convert("RGB").quantize(256, method, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     said = PngInfo()
     said.add_text("Software", MADE_BY)

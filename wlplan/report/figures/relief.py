@@ -38,6 +38,8 @@ _CONTOUR_STEPS = (2.0, 1.0, 0.5, 0.25, 0.1)
 _LEAST_CONTOURS = 4
 # Ground shown around the pile [m].
 _MARGIN = 2.0
+# Where light comes from on maps, counter-clockwise from east [rad].
+_NORTH_WEST = math.radians(135.0)
 
 
 def height_above_ground(pile: Pile) -> Float[np.ndarray, "nx ny"]:
@@ -94,17 +96,25 @@ def shaped(
     return np.stack([view[0] - (1.0 - share) * grow, view[1] + share * grow])
 
 
-def _relief(height: Float[np.ndarray, "nx ny"], cell_size: float) -> Float[np.ndarray, "nx ny"]:
-    """Brightness of a surface lit from the north-west, 1 where it is level."""
-    # Light from 315 degrees at 40 degrees above the horizon; slopes are drawn 1.3 times as steep.
+def brightness(
+    height: Float[np.ndarray, "nx ny"], cell_size: float, *, light_from: float = _NORTH_WEST
+) -> Float[np.ndarray, "nx ny"]:
+    """Brightness of a lit surface, 1 where it is level.
+
+    Args:
+        height: Of the surface [m].
+        cell_size: Grid spacing [m].
+        light_from: Where the light comes from, counter-clockwise from +x [rad].
+    """
+    # Light at 40 degrees above the horizon; slopes are drawn 1.3 times as steep.
     elevation, exaggeration = math.radians(40.0), 1.3
     east, north = np.gradient(exaggeration * height, cell_size)
-    light = np.array([-math.sqrt(0.5), math.sqrt(0.5)]) * math.cos(elevation)
+    light = np.array([math.cos(light_from), math.sin(light_from)]) * math.cos(elevation)
     facing = (math.sin(elevation) - east * light[0] - north * light[1]) / np.sqrt(
         1.0 + east**2 + north**2
     )
-    brightness: np.ndarray = np.clip(1.0 + 0.6 * (facing - math.sin(elevation)), 0.4, 1.13)
-    return brightness
+    shade: np.ndarray = np.clip(1.0 + 0.6 * (facing - math.sin(elevation)), 0.4, 1.13)
+    return shade
 
 
 def draw_pile(
@@ -120,7 +130,7 @@ def draw_pile(
     surface = np.asarray(pile.height, float)
     image = colours(norm(above))[..., :3]
     image[standing(np.asarray(pile.floor), pile.cell_size)] = to_rgb(STANDS)
-    image = image * _relief(surface, pile.cell_size)[..., np.newaxis]
+    image = image * brightness(surface, pile.cell_size)[..., np.newaxis]
     panel.imshow(
         np.clip(image, 0.0, 1.0).transpose(1, 0, 2),
         origin="lower",
