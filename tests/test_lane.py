@@ -2,21 +2,25 @@
 
 import dataclasses
 import itertools
+import json
 import math
 import threading
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from wlplan.dataset.protocol import Episode
+from wlplan.cli import main
+from wlplan.dataset.episode import Episode
 from wlplan.dataset.vector_simulator import VectorSimulator
 from wlplan.engines.simulator import STOP_REASONS, Settings, Simulator, dig
 from wlplan.engines.simulator.cycle import Cycle
 from wlplan.engines.simulator.lane import LENGTH, RESIDUE, ROWS, dig_through_lane, lane_of
+from wlplan.io import write_pile
 from wlplan.site.machine import WA320
 from wlplan.site.soil import GRAVEL
 from wlplan.terrain.automaton import steepest_slope
@@ -249,9 +253,15 @@ def test_an_episode_side_by_side_is_played_as_one_alone(solve: Plays) -> None:
             self.pose = np.array(at, np.float32)
             return self.pose, np.array(MODERATE, np.float32)
 
-    episodes, finished = iter([Lanes(0, 0, 3, Simulator(lane_soil=True), length=3)]), list[Episode | None]()
+    episodes, finished = (
+        iter([Lanes(0, 0, 3, Simulator(lane_soil=True), length=3)]),
+        list[Episode | None](),
+    )
     VectorSimulator(
-        Simulator(lane_soil=True), lambda: next(episodes, None), finished.append, threading.Event()
+        Simulator(lane_soil=True),
+        lambda: next(episodes, None),
+        finished.append,
+        threading.Event(),
     ).run()
     (episode,) = (one for one in finished if one is not None)
     pile = pile_of(mound(4.6, 5.2), mound(6.0, 9.4)).replace(ground=None)
@@ -263,6 +273,28 @@ def test_an_episode_side_by_side_is_played_as_one_alone(solve: Plays) -> None:
             np.testing.assert_allclose(loading[name], getattr(performance, name), rtol=1e-3)
     np.testing.assert_allclose(episode.height, pile.height, atol=0.02)
     assert met[:2] == [True, True]
+
+
+@pytest.mark.slow
+def test_a_plan_is_played_over_soil_in_the_lane_and_says_so(
+    tmp_path: Path,
+) -> None:
+    scan, plan, out = tmp_path / "scan.npz", tmp_path / "plan.json", tmp_path / "out"
+    # A tongue that the pile sends into the lane: what lies apart is another pile.
+    write_pile(scan, pile_of(np.where(X > 4.5, np.maximum(0.4 - 0.5 * np.abs(Y - 6.0), 0.0), 0.0)))
+    keys = ("delta_bm", "k_bm", "delta_bk", "k_bk")
+    load = {"x": 8.0, "y": 6.0, "heading": 0.0, "action": dict(zip(keys, MODERATE, strict=True))}
+    plan.write_text(json.dumps({"format": "wlplan.plan/1", "loads": [load]}))
+    loaded = {}
+    for engine in ("simulator", "simulator-lane"):
+        words = [str(scan), str(plan), "--engine", engine, "--out", str(out / engine)]
+        assert main(["simulate", *words]) == 0
+        document = json.loads((out / engine / "plan.json").read_text())
+        loaded[engine] = document["total"]["simulated"]["mass"]
+        assert document.get("engine", "simulator") == engine
+    assert loaded["simulator-lane"] != pytest.approx(loaded["simulator"], rel=0.01)
+    page = (out / "simulator-lane" / "report.html").read_text()
+    assert "played in the simulator with soil in the approach lane" in page
 
 
 # --- Derivatives. -------------------------------------------------------------------------------

@@ -105,7 +105,8 @@ def test_the_names_are_those_that_load() -> None:
 
 def test_worlds_say_whether_they_have_a_derivative() -> None:
     said = {name: is_differentiable(load_world(name)) for name in WORLDS}
-    assert said == {"low": True, "hybrid": True, "high": True, "simulator": False, "dem": False}
+    assert {name for name, has_one in said.items() if has_one} == {"low", "hybrid", "high"}
+    assert said.keys() == WORLDS.keys()
     assert is_differentiable(with_derivatives(load_world("simulator"))) is True
 
     def mine(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:

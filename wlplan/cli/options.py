@@ -295,11 +295,11 @@ planner_option = click.option(
 )
 engine_option = click.option(
     "--engine",
-    type=click.Choice(ENGINES),
-    default=ENGINES[0],
+    type=click.Choice(list(ENGINES)),
+    default=next(iter(ENGINES)),
     show_default=True,
-    help="Engine that plays the plan: the simulator, or discrete elements, which take minutes a "
-    "load and need wlplan[dem].",
+    help="Engine that plays the plan: the simulator; the same with the soil that lies in the "
+    "approach lane; or discrete elements, which take minutes a load and need wlplan[dem].",
 )
 scatter_option = click.option(
     "--scatter",

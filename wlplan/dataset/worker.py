@@ -110,4 +110,5 @@ def simulator_from_json(parts: dict[str, Any]) -> Simulator:
         soil=Soil(**parts["soil"]),
         settings=Settings(**parts["settings"]),
         schedule=Schedule(**schedule),
+        lane_soil=parts.get("lane_soil", False),
     )

@@ -55,7 +55,11 @@ class CollectionSettings:
     def to_json(self) -> dict[str, Any]:
         """As JSON holds it; `wlplan.dataset.worker.simulator_from_json` reads the simulator."""
         parts = ("machine", "soil", "settings", "schedule")
+        simulator: dict[str, Any]
         simulator = {name: dataclasses.asdict(getattr(self.simulator, name)) for name in parts}
+        # Data sets from before there was a choice say nothing of it.
+        if self.simulator.lane_soil:
+            simulator["lane_soil"] = True
         rest = {name: getattr(self, name) for name in ("seed", "loads", "length", "protocol")}
         return {"simulator": simulator, **rest}
 

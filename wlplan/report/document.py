@@ -287,10 +287,11 @@ def write_plan_folder(
     from wlplan.report.page import REPORT_NAME, write_report
     from wlplan.report.pictures import galleries_of
     from wlplan.report.scene import scene_of
+    from wlplan.worlds.names import engine_of
 
     count, after = len(document["loads"]), simulated.rollout.pile
     performance, deviation = simulated.rollout.performance, deviation_of(document)
-    played_in = "discrete elements" if document.get("engine") == "dem" else "the simulator"
+    played_in = engine_of(document).title
     shown = figures.PlanOnPile(
         pile,
         simulated.plan,

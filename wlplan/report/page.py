@@ -14,6 +14,7 @@ from wlplan.report.ledger import LEDGER_TOLERANCE, ledger_error, volume_lost
 from wlplan.report.stands import stands_of
 from wlplan.report.template import Gallery, rendered
 from wlplan.site.frame import frame_recorded
+from wlplan.worlds.names import engine_of
 
 REPORT_NAME = "report.html"
 
@@ -64,6 +65,7 @@ def render_report(
         "plan.html.j2",
         scene=scene,
         document=document,
+        played_in=engine_of(document).title,
         offset=frame_recorded(document).offset,
         stands=stands_of(document),
         job=headline(document),

@@ -5,7 +5,8 @@ A new world is an entry here.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 
 class Learned(NamedTuple):
@@ -16,19 +17,33 @@ class Learned(NamedTuple):
     stall: str = "stall"  # what foresees stalls
 
 
-WORLDS: dict[str, Learned | str] = {
+class Engine(NamedTuple):
+    """A world that plays loadings without having learnt."""
+
+    maker: str  # "module:name" of what makes it of `machine` and `soil`
+    title: str  # as pages and tables say it
+
+
+WORLDS: dict[str, Learned | Engine] = {
     "low": Learned("psi_low"),
     "hybrid": Learned("psi_high"),
     "high": Learned("psi_high", "phi"),
-    # Engines: classes that are made with `machine` and `soil`.
-    "simulator": "wlplan.engines.simulator:Simulator",
-    "dem": "wlplan.engines.dem.world:DiscreteElements",
+    "simulator": Engine("wlplan.engines.simulator:Simulator", "the simulator"),
+    "simulator-lane": Engine(
+        "wlplan.engines.simulator:with_lane_soil", "the simulator with soil in the approach lane"
+    ),
+    "dem": Engine("wlplan.engines.dem.world:DiscreteElements", "discrete elements"),
 }
 """Worlds by name."""
 
-ENGINES = tuple(name for name, world in WORLDS.items() if isinstance(world, str))
-"""Names of the worlds that play plans without having learnt."""
+ENGINES = {name: world for name, world in WORLDS.items() if isinstance(world, Engine)}
+"""Those that play plans without having learnt; the first is the usual one."""
 
-# The discrete elements take minutes a loading.
-FOR_PLANNING = tuple(name for name in WORLDS if name != "dem")
-"""Names of the worlds that are quick enough to plan in."""
+# The discrete elements take minutes a loading. The soil in the lane is for checking a plan.
+FOR_PLANNING = tuple(name for name in WORLDS if name not in ("dem", "simulator-lane"))
+"""Names of the worlds that commands plan in."""
+
+
+def engine_of(document: Mapping[str, Any]) -> Engine:
+    """What played a plan, by its `plan.json`; that names no engine where it was the usual one."""
+    return ENGINES.get(document.get("engine", ""), next(iter(ENGINES.values())))

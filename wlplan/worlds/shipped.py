@@ -14,7 +14,7 @@ from wlplan.site.presets import check_machine, check_soil
 from wlplan.site.soil import GRAVEL, Soil
 from wlplan.types import World
 from wlplan.worlds.learned import LearnedWorld
-from wlplan.worlds.names import WORLDS
+from wlplan.worlds.names import WORLDS, Engine
 from wlplan.worlds.pile_states import Strip
 
 
@@ -36,8 +36,9 @@ def load_world(
 
     Args:
         name: "low" (ψ_low and the automaton), "hybrid" (ψ_high and the automaton), "high" (ψ_high
-            and φ) or "simulator". "dem" is the discrete-element engine, which takes minutes a
-            loading, has no derivative, and needs `pip install 'wlplan[dem]'`.
+            and φ) or "simulator". "simulator-lane" is the same with the soil that lies in the
+            approach lane. "dem" is the discrete-element engine, which takes minutes a loading, has
+            no derivative, and needs `pip install 'wlplan[dem]'`.
         model: Directory of a trained ψ, of either kind, instead of the one that ships.
         pile_state: Directory of a trained φ, of either kind, instead of the one that ships, or of
             the strip and the automaton.
@@ -56,10 +57,10 @@ def load_world(
     if not isinstance(name, str) or name not in WORLDS:
         raise InputError(f"unknown world {name!r}: choose one of {', '.join(WORLDS)}.")
     recipe = WORLDS[name]
-    if isinstance(recipe, str):
+    if isinstance(recipe, Engine):
         if any(given is not None for given in (model, pile_state, stall)):
             raise InputError(f"the world {name!r} has no models: leave them out.")
-        engine: World = load_object(recipe)(machine=machine, soil=soil)
+        engine: World = load_object(recipe.maker)(machine=machine, soil=soil)
         return engine
     psi = _model(recipe.performance if model is None else Path(model), _PERFORMANCE)
     place = recipe.pile_state if pile_state is None else Path(pile_state)

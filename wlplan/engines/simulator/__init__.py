@@ -3,7 +3,7 @@
 from wlplan.engines.limits import STOP_REASONS
 from wlplan.engines.simulator.cycle import Cycle, Settings, dig
 from wlplan.engines.simulator.trajectory import Section, Trajectory, trace, trace_section
-from wlplan.engines.simulator.world import Simulator
+from wlplan.engines.simulator.world import Simulator, with_lane_soil
 
 __all__ = [
     "STOP_REASONS",
@@ -15,4 +15,5 @@ __all__ = [
     "dig",
     "trace",
     "trace_section",
+    "with_lane_soil",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple, no_type_check
+from typing import Any, NamedTuple, no_type_check
 
 import jax
 import jax.numpy as jnp
@@ -158,6 +158,11 @@ class Simulator(struct.PyTreeNode):
         )
         report = SolveReport(rounds.sum(), at_rest.all(), slope[1], missing.sum())
         return pile.replace(height=height), report
+
+
+def with_lane_soil(**parts: Any) -> Simulator:
+    """A simulator whose loader meets the soil in its approach lane; parts as of `Simulator`."""
+    return Simulator(**parts, lane_soil=True)
 
 
 class _Changes(NamedTuple):

@@ -1,0 +1,149 @@
+"""Soil in the approach lane: the simulator beside discrete elements, with the lane and without.
+
+Each cycle of the reference digs a pile over a ridge that lies in the lane. Beside stand the same
+cycles in the simulator that meets the ridge, in the one that takes the lane as free, and, where
+they were played, those of the discrete elements without the ridge.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments._common.results import main
+from experiments.dem_reference import MACHINE
+from wlplan.engines.simulator import STOP_REASONS, Simulator
+from wlplan.io import write_bytes_atomic
+from wlplan.report.figures import png_bytes
+from wlplan.site.soil import GRAVEL
+from wlplan.types import Pile, Pose, action_from
+
+_FOLDER = Path(__file__).parents[1] / "tests" / "references"
+RIDGE, FREE = _FOLDER / "dem_lane.npz", _FOLDER / "dem_lane_free.npz"
+"""The cycles with the ridge, and the same without, of `experiments.dem_cycles --lane`."""
+CHOSEN_ON = 2
+"""Cycles that the form of the resistance in the lane was chosen on: the first."""
+_UNITS = {"mass": "t", "time": "s", "work": "kJ"}
+_COLOURS = {"meets": "#1f5fa8", "free": "#b9c4d0"}
+
+
+def load(path: Path, count: int | None = None) -> dict[str, np.ndarray]:
+    """Fields of the first cycles of a file; heights before in metres."""
+    with np.load(path) as archive:
+        cycles = {name: archive[name][:count] for name in archive if archive[name].ndim}
+        unit, grid = archive["unit_m"], (archive["grid_x"], archive["grid_y"])
+    first = np.array([axis[0] for axis in grid], np.float32)
+    return cycles | {"h0_cg": cycles["h0_cg"] * np.float32(unit), "first": first}
+
+
+def replay(cycles: dict[str, np.ndarray], *, lane_soil: bool) -> dict[str, np.ndarray]:
+    """The simulator on the surfaces of the reference, with its actions and machine.
+
+    Returns:
+        mass [tonne], time [s], work without slip [kJ] and stop_reason, each of shape [cycles].
+    """
+    simulator = Simulator(machine=MACHINE, soil=GRAVEL, lane_soil=lane_soil)
+    pose = Pose(*jnp.zeros(3))
+
+    @jax.jit
+    def one(height: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pile = Pile(height, 0.1, jnp.asarray(cycles["first"]))
+        _, performance, cycle = simulator.play(pile, pose, action_from(action))
+        # The reference counts thrust times vehicle speed, boom and bucket, without slip.
+        work = performance.work - cycle.work_slip / 1e3
+        return jnp.stack([performance.mass, performance.time, work]), cycle.stop_reason
+
+    played = [
+        one(jnp.asarray(height), jnp.asarray(action, jnp.float32))
+        for height, action in zip(cycles["h0_cg"], cycles["action"], strict=True)
+    ]
+    numbers = np.array([row for row, _ in played])
+    stops = np.array([STOP_REASONS[int(stop)] for _, stop in played])
+    return dict(zip(_UNITS, numbers.T, strict=True)) | {"stop_reason": stops}
+
+
+def _beside(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
+    difference = ours / theirs - 1.0
+    return {
+        "bias": float(ours.mean() / theirs.mean() - 1.0),
+        "mean_relative_difference": float(np.abs(difference).mean()),
+        "median_relative_difference": float(np.median(np.abs(difference))),
+    }
+
+
+def run(preset: str) -> dict[str, Any]:
+    """Plays the reference's cycles in both simulators."""
+    count = 2 if preset == "smoke" else None
+    cycles = load(RIDGE, count)
+    ours = {
+        "meets": replay(cycles, lane_soil=True),
+        "free": replay(cycles, lane_soil=False),
+    }
+    theirs = {name: cycles[f"{name}_{unit}"] for name, unit in _UNITS.items()}
+    held_out = np.arange(len(theirs["mass"])) >= (0 if preset == "smoke" else CHOSEN_ON)
+    result: dict[str, Any] = {
+        "cycles": len(theirs["mass"]),
+        "held_out": int(held_out.sum()),
+        "agreement_held_out": {
+            which: {n: _beside(played[n][held_out], theirs[n][held_out]) for n in _UNITS}
+            for which, played in ours.items()
+        },
+        "same_stop_reason": {
+            which: int((played["stop_reason"] == cycles["stop_reason"]).sum())
+            for which, played in ours.items()
+        },
+        "ridge": {
+            name: np.round(cycles[f"ridge_{name}"], 3).tolist()
+            for name in ("m", "before_m", "length_m", "left_m", "turn_deg")
+        },
+        "shape": cycles["shape"].tolist(),
+        "dem": {n: np.round(v.astype(float), 3).tolist() for n, v in theirs.items()}
+        | {"stop_reason": cycles["stop_reason"].tolist()},
+        **{
+            which: {n: np.round(played[n].astype(float), 3).tolist() for n in _UNITS}
+            | {"stop_reason": played["stop_reason"].tolist()}
+            for which, played in ours.items()
+        },
+    }
+    if FREE.exists():
+        without = load(FREE, count)
+        level = replay(without, lane_soil=False)
+        result["without_ridge"] = {
+            "dem": {
+                n: np.round(without[f"{n}_{unit}"].astype(float), 3).tolist()
+                for n, unit in _UNITS.items()
+            }
+            | {"stop_reason": without["stop_reason"].tolist()},
+            "ours": {n: np.round(level[n].astype(float), 3).tolist() for n in _UNITS}
+            | {"stop_reason": level["stop_reason"].tolist()},
+        }
+    return result
+
+
+def draw(folder: Path) -> None:
+    """Outcome of each cycle against that of the discrete elements."""
+    from matplotlib.figure import Figure
+
+    result = json.loads((folder / "lane.json").read_text())
+    figure = Figure(figsize=(9.6, 3.4), layout="constrained")
+    for axis, (name, unit) in zip(figure.subplots(1, 3), _UNITS.items(), strict=True):
+        theirs = result["dem"][name]
+        drawn = list(theirs)
+        for which, label in (("free", "lane taken as free"), ("meets", "lane met")):
+            axis.plot(theirs, result[which][name], "o", ms=5, color=_COLOURS[which], label=label)
+            drawn += result[which][name]
+        axis.plot([min(drawn), max(drawn)], [min(drawn), max(drawn)], color="#999999", lw=1)
+        axis.set_xlabel(f"{name}, discrete elements [{unit}]")
+        axis.set_ylabel(f"this simulator [{unit}]")
+        axis.set_aspect("equal", adjustable="datalim")
+    figure.axes[0].legend(fontsize=8, frameon=False)
+    write_bytes_atomic(folder / "lane.png", png_bytes(figure))
+
+
+if __name__ == "__main__":
+    main("lane", run, draw)
