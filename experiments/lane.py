@@ -2,12 +2,14 @@
 
 Each cycle of the reference digs a pile over a ridge that lies in the lane. Beside stand the same
 cycles in the simulator that meets the ridge, in the one that takes the lane as free, and, where
-they were played, those of the discrete elements without the ridge.
+they were played, those of the discrete elements without the ridge. Then greedy plans, played in
+both simulators: what the lane makes of whole jobs.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import wlplan
+from experiments._common.places import say
 from experiments._common.results import main
 from experiments.dem_reference import MACHINE
 from wlplan.engines.simulator import STOP_REASONS, Simulator
 from wlplan.io import write_bytes_atomic
+from wlplan.planning.planners import Greedy
 from wlplan.report.figures import png_bytes
 from wlplan.site.soil import GRAVEL
 from wlplan.types import Pile, Pose, action_from
@@ -28,6 +33,13 @@ RIDGE, FREE = _FOLDER / "dem_lane.npz", _FOLDER / "dem_lane_free.npz"
 """The cycles with the ridge, and the same without, of `experiments.dem_cycles --lane`."""
 CHOSEN_ON = 2
 """Cycles that the form of the resistance in the lane was chosen on: the first."""
+PILES = {"cone": "conical", "ridge": "triangular", "wedge": "wedge"}
+"""Piles that plans are made for, and their kind."""
+SLOPE_DEGREES, LOADS, SEEDS = 30.0, 30, (1, 2)
+# A cycle of this time has stalled: it filled until its time was up [s].
+_STALL = 17.0
+# A load counts as another where its mass differs by more than this part.
+_ANOTHER = 0.02
 _UNITS = {"mass": "t", "time": "s", "work": "kJ"}
 _COLOURS = {"meets": "#1f5fa8", "free": "#b9c4d0"}
 
@@ -122,7 +134,36 @@ def run(preset: str) -> dict[str, Any]:
             "ours": {n: np.round(level[n].astype(float), 3).tolist() for n in _UNITS}
             | {"stop_reason": level["stop_reason"].tolist()},
         }
+    result["plans"] = plans(preset)
     return result
+
+
+def plans(preset: str) -> list[dict[str, Any]]:
+    """Greedy plans of the low world, played with lanes taken as free and met."""
+    smoke = preset == "smoke"
+    planner = Greedy(actions=6, refine_steps=2, poses_per_metre=0.3) if smoke else Greedy()
+    world = wlplan.load_world("low")
+    rows = []
+    for name, kind in {"cone": "conical"}.items() if smoke else PILES.items():
+        for seed in SEEDS[: 1 if smoke else None]:
+            pile = wlplan.seed_pile(kind, slope=math.radians(SLOPE_DEGREES), seed=seed)
+            pile = wlplan.relax(pile)
+            loads = 2 if smoke else LOADS
+            plan = wlplan.plan_loads(world, pile, loads=loads, planner=planner, seed=seed).plan
+            performance = {
+                which: wlplan.play(wlplan.load_world(engine), pile, plan).rollout.performance
+                for which, engine in (("free", "simulator"), ("meets", "simulator-lane"))
+            }
+            masses = {which: np.asarray(one.mass) for which, one in performance.items()}
+            row: dict[str, Any] = {"pile": name, "seed": seed, "loads": len(masses["free"])}
+            for which, one in performance.items():
+                row[which] = {n: round(float(getattr(one, n).sum()), 3) for n in _UNITS}
+                row[which]["stalls"] = int((np.asarray(one.time) > _STALL).sum())
+            apart = np.abs(masses["meets"] / np.maximum(masses["free"], 1e-3) - 1.0)
+            row["other_loads"] = int((apart > _ANOTHER).sum())
+            rows.append(row)
+            say(json.dumps(row))
+    return rows
 
 
 def draw(folder: Path) -> None:

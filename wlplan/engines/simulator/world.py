@@ -156,6 +156,8 @@ class Simulator(struct.PyTreeNode):
         height, (rounds, at_rest, slope, missing) = lax.scan(
             turn, pile.height, (poses, both, is_wanted)
         )
+        # The way through a loop gives even these tangents, of which JAX has no rule.
+        rounds, at_rest = lax.stop_gradient((rounds, at_rest))
         report = SolveReport(rounds.sum(), at_rest.all(), slope[1], missing.sum())
         return pile.replace(height=height), report
 
