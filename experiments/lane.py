@@ -109,6 +109,14 @@ def run(preset: str) -> dict[str, Any]:
             which: int((played["stop_reason"] == cycles["stop_reason"]).sum())
             for which, played in ours.items()
         },
+        "stalls": {
+            which: {
+                "dem": int((theirs_stall := cycles["stop_reason"] == "timeout").sum()),
+                "ours": int((stalls := played["stop_reason"] == "timeout").sum()),
+                "both": int((stalls & theirs_stall).sum()),
+            }
+            for which, played in ours.items()
+        },
         "ridge": {
             name: np.round(cycles[f"ridge_{name}"], 3).tolist()
             for name in ("m", "before_m", "length_m", "left_m", "turn_deg")
