@@ -2,8 +2,9 @@
 
     python tests/regenerate.py calibration.npz      the 39 cycles that constants were fitted to
     python tests/regenerate.py FOLDER_OF_CYCLES     others, that nothing was fitted to
+    python tests/regenerate.py RIDGES.npz           those of `experiments.dem_cycles --lane ridge`
 
-Both hold loading cycles of an independent discrete-element engine (LAMMPS), played in closed loop
+All hold loading cycles of an independent discrete-element engine (LAMMPS), played in closed loop
 with the same controller; their fields are named in the code. `python -m experiments.dem_cycles`
 makes more of the kind. Kept of a cycle: surface before and after, action, outcome, and the path of
 the bucket with the forces on it until filling ends.
@@ -90,8 +91,23 @@ def held_out(folder: Path) -> dict[str, np.ndarray]:
     }
 
 
+def lane(path: Path) -> None:
+    """Writes the cycles over ridges without what no comparison needs: paths and envelopes."""
+    with np.load(path) as cycles:
+        kept: dict[str, Any] = {
+            name: cycles[name] for name in cycles if name not in ("traj", "traj_names", "h0", "h1")
+        }
+    target = Path(__file__).parent / "references" / "dem_lane.npz"
+    np.savez_compressed(target, **kept)
+    print(f"{target}: {len(kept['mass_t'])} cycles, {target.stat().st_size / 1024:.0f} KiB")
+
+
 def main(path: Path) -> None:
     """Writes the reference that a path is the source of."""
+    if not path.is_dir():
+        with np.load(path) as archive:
+            if "ridge_m" in archive:
+                return lane(path)
     name, fields = (
         ("dem_held_out", held_out(path)) if path.is_dir() else ("dem_cycles", fitted(path))
     )

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.lane import RIDGE, load, replay
 from wlplan.cli import main
 from wlplan.dataset.episode import Episode
 from wlplan.dataset.vector_simulator import VectorSimulator
@@ -295,6 +296,21 @@ def test_a_plan_is_played_over_soil_in_the_lane_and_says_so(
     assert loaded["simulator-lane"] != pytest.approx(loaded["simulator"], rel=0.01)
     page = (out / "simulator-lane" / "report.html").read_text()
     assert "played in the simulator with soil in the approach lane" in page
+
+
+@pytest.mark.slow
+def test_it_stalls_over_the_ridges_that_stall_the_discrete_elements() -> None:
+    """A guard against regressions; the table is in docs/simulator.md."""
+    cycles = load(RIDGE)
+    theirs = cycles["stop_reason"] == "timeout"
+    met, free = (replay(cycles, lane_soil=which) for which in (True, False))
+    stalls = met["stop_reason"] == "timeout"
+    assert theirs.sum() == 4
+    assert (stalls & theirs).sum() == 4
+    assert stalls.sum() <= 5
+    assert ((free["stop_reason"] == "timeout") & theirs).sum() == 1
+    np.testing.assert_allclose(met["mass"], cycles["mass_t"], rtol=0.25)
+    assert abs(met["mass"].mean() / cycles["mass_t"].mean() - 1.0) < 0.08
 
 
 # --- Derivatives. -------------------------------------------------------------------------------
