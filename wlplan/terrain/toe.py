@@ -60,7 +60,11 @@ def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA
         raise InputError(f"The rise is {rise:g} m: it has to be positive.")
     cell = pile.cell_size
     check_pile(pile)
-    above = np.asarray(pile.height, np.float64) - np.asarray(pile.floor, np.float64)
+    # A level floor is not made: every loading of a data set comes this way.
+    ground = None if pile.ground is None else np.asarray(pile.ground, np.float64)
+    above = np.asarray(pile.height, np.float64)
+    if ground is not None:
+        above = above - ground
     origin = np.asarray(pile.origin, np.float64)
     line = largest_outline(above, rise=rise, origin=origin, cell=cell, width=machine.bucket_width)
     closed = bool(line[0] == line[-1]) and len(line) > 2
@@ -99,8 +103,8 @@ def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA
     if pile.valid is not None:
         seen = np.asarray(pile.valid, np.float64)
         accessible &= _sample(seen, points, origin, cell) > 1.0 - 1e-6
-    stands = standing(np.asarray(pile.floor), cell)
-    if stands.any():
+    stands = None if ground is None else standing(ground, cell)
+    if stands is not None and stands.any():
         # From where the rear of the loader is when it stops behind the dig location.
         rear = machine.approach_distance + 0.5 * machine.length
         ahead = np.arange(-rear, 0.5 * machine.bucket_depth, LANE_STEP)
