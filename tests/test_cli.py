@@ -1,5 +1,6 @@
 """The command line: results on stdout, one line on stderr for whatever is wrong, whole files."""
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -7,7 +8,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -1131,3 +1132,22 @@ def test_bad_input_as_a_process(tmp_path: Path) -> None:
     assert done.stderr.startswith("error: bad.npz")
     assert done.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["bad.npz"]
+
+
+@pytest.mark.parametrize("on_a_terminal", [True, False])
+def test_the_plan_is_seen_before_it_is_drawn_where_someone_waits(
+    run: Run, scan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_a_terminal: bool
+) -> None:
+    """Into a pipe it goes when all is written: a pipe may break."""
+
+    @contextlib.contextmanager
+    def no_room(*_: object, **__: object) -> Iterator[Path]:
+        raise InputError("no space left on the disk")
+        yield tmp_path
+
+    monkeypatch.setattr(io.files, "atomic_folder", no_room)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: on_a_terminal, raising=False)
+    code, out, err = run("plan", scan, "--loads", 1, "--out", tmp_path / "out")
+    assert code == 2
+    assert err.splitlines()[-1] == "error: no space left on the disk"
+    assert ("ledger:" in out) == on_a_terminal

@@ -149,7 +149,10 @@ def gradcheck(
     if as_json:
         click.echo(text)
     else:
-        _print_check(check, f"{loads} loads from {named.fields['file']}, {world_name} world")
+        _print_check(
+            check,
+            f"{loads} load{'s'[: loads != 1]} from {named.fields['file']}, {world_name} world",
+        )
         say(f"gradient and differences {checking.text()}")
         if folder is not None:
             say(f"written: {folder / 'gradcheck.json'}")

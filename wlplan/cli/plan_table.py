@@ -36,7 +36,8 @@ def print_plan(document: Mapping[str, Any]) -> None:
     total, ledger = document["total"], document["ledger"]
     predicted = total.get("predicted", {})
     frame = frame_recorded(document)
-    table = titled_table(f"{len(document['loads'])} loads from {document['pile']['file']}")
+    count = len(document["loads"])
+    table = titled_table(f"{count} load{'s'[: count != 1]} from {document['pile']['file']}")
     table.add_column("load")
     # Short titles: all of it fits a terminal of 80 columns.
     for title in ("x\n[m]", "y\n[m]", "head.\n[°]"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -117,7 +118,6 @@ def plan(
     with Progress(kept.seconds(kind)) as progress:
         progress.phase("starting")
 
-        from wlplan.io.files import atomic_folder
         from wlplan.report.making import Asked, make_plan
 
         progress.phase(f"reading {pile_file.name}")
@@ -160,25 +160,54 @@ def plan(
         document = made.document
         text = json_text(document)
         seconds = {part: clock.text() for part, clock in clocks.items()}
-        written = None
-        if folder is not None:
-            progress.phase("drawing")
-            settings = {f"{name}, wall clock": text for name, text in seconds.items()}
-            with atomic_folder(folder, existing="add") as staging:
-                written = made.write(staging, settings=settings, also=also)
-    for note in document["notes"]:
-        remark(note)
-    remark_on_ledger(document["ledger"])
-    for name, numbers in made.violated.items():
-        remark(f"{name} is violated by load {', '.join(map(str, numbers))}")
-    if as_json:
-        click.echo(text)
-    else:
+
+    def show() -> None:
+        for note in document["notes"]:
+            remark(note)
+        remark_on_ledger(document["ledger"])
+        for name, numbers in made.violated.items():
+            remark(f"{name} is violated by load {', '.join(map(str, numbers))}")
+        if as_json:
+            click.echo(text)
+            return
         print_plan(document)
         say("; ".join(f"{name} {text}" for name, text in seconds.items()))
-        _print_written(folder, written)
+
+    def write(staging: Path) -> list[str]:
+        settings = {f"{name}, wall clock": text for name, text in seconds.items()}
+        return made.write(staging, settings=settings, also=also)
+
+    _show_and_write(folder, show, write, as_json=as_json)
     if made.planned.stopped == "interrupted":
         raise click.exceptions.Exit(_INTERRUPTED)
+
+
+def _show_and_write(
+    folder: Path | None,
+    show: Callable[[], None],
+    write: Callable[[Path], list[str]],
+    *,
+    as_json: bool,
+) -> None:
+    """Shows a plan and writes it to a folder, if there is one.
+
+    On a terminal the plan is shown first, for pictures and page take seconds more. Into a pipe,
+    which may break, it goes when all is written.
+    """
+    from wlplan.io.files import atomic_folder
+
+    is_waited_for = sys.stdout.isatty() and not as_json
+    if is_waited_for:
+        show()
+    written = None
+    if folder is not None:
+        with Progress() as progress, atomic_folder(folder, existing="add") as staging:
+            progress.phase("drawing")
+            written = write(staging)
+    if not is_waited_for:
+        show()
+    if not as_json:
+        _print_written(folder, written)
 
 
 def _folder_of(out: str | None, also: Sequence[str]) -> Path | None:
@@ -252,7 +281,6 @@ def simulate(
     folder = _folder_of(out, also)
 
     from wlplan.io import read_plan
-    from wlplan.io.files import atomic_folder
     from wlplan.io.files import named as named_file
     from wlplan.planning.amounts import amount_recorded
     from wlplan.planning.piles import heights_after
@@ -344,31 +372,33 @@ def simulate(
     for load, cycle in zip(document["loads"], cycles, strict=False):
         load["cycle"] = cycle
     text = json_text(document)
-    written = None
-    if folder is not None:
-        with atomic_folder(folder, existing="add") as staging:
-            written = write_plan_folder(
-                staging,
-                document,
-                pile,
-                played,
-                site=place,
-                predicted=predicted,
-                # In discrete elements a load takes minutes, and is not made once more.
-                heights=None if cycles else heights_after(simulator, pile, played.plan),
-                settings={f"{engine}, wall clock": playing.text()},
-                also=also,
-            )
-    for note in document["notes"]:
-        remark(note)
-    remark_on_ledger(document["ledger"])
-    if as_json:
-        click.echo(text)
-        return
-    print_plan(document)
-    drawn = "" if scatter is None else f", scatter drawn from seed {scatter},"
-    say(f"{engine}{drawn} {playing.text()}")
-    _print_written(folder, written)
+
+    def show() -> None:
+        for note in document["notes"]:
+            remark(note)
+        remark_on_ledger(document["ledger"])
+        if as_json:
+            click.echo(text)
+            return
+        print_plan(document)
+        drawn = "" if scatter is None else f", scatter drawn from seed {scatter},"
+        say(f"{engine}{drawn} {playing.text()}")
+
+    def write(staging: Path) -> list[str]:
+        return write_plan_folder(
+            staging,
+            document,
+            pile,
+            played,
+            site=place,
+            predicted=predicted,
+            # In discrete elements a load takes minutes, and is not made once more.
+            heights=None if cycles else heights_after(simulator, pile, played.plan),
+            settings={f"{engine}, wall clock": playing.text()},
+            also=also,
+        )
+
+    _show_and_write(folder, show, write, as_json=as_json)
 
 
 def _truck_of(document: Mapping[str, Any], frame: Frame) -> tuple[float, ...] | None:
