@@ -39,6 +39,7 @@ from wlplan.types import (
     action_from,
 )
 from wlplan.worlds.learned import LearnedWorld
+from wlplan.worlds.shipped import pretrained_path
 
 MEMBERS = 5
 LIGHT: dict[str, Any] = {
@@ -200,6 +201,25 @@ def test_the_gradient_of_mean_and_deviation_is_finite_also_far_from_the_data(
     jacobian = jax.jit(jax.jacrev(lambda v, a: with_deviation(model, v, a), (0, 1)))
     for view in (jnp.zeros(4), jnp.array([0.4, 0.5, 0.0, 0.1]), jnp.full(4, 1e4)):
         assert all(np.isfinite(slope).all() for slope in jacobian(view, ACTION))
+
+
+def test_the_gradient_of_mean_and_deviation_is_that_of_finite_differences() -> None:
+    """Of the weights that ship: a part of the deviation is in their mean."""
+    with jax.enable_x64(True):
+        model = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, jnp.float64), load_model(pretrained_path("psi_low"))
+        )
+        view = jnp.array([0.45, 0.1, 0.02, -0.03])
+        point = np.asarray(ACTION, np.float64)
+
+        def of(action: jax.Array) -> jax.Array:
+            return with_deviation(model, view, action)
+
+        exact = np.asarray(jax.jacfwd(of)(jnp.asarray(point)))
+        steps = 1e-5 * np.eye(4)
+        central = np.stack([(of(point + s) - of(point - s)) / 2e-5 for s in steps], axis=-1)
+    np.testing.assert_allclose(exact, central, rtol=1e-4, atol=1e-6)
+    assert np.abs(exact).min() > 0.0
 
 
 def test_an_ensemble_comes_back_bit_by_bit(saved: tuple[Path, Ensemble, EvaluationReport]) -> None:

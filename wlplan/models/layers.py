@@ -171,9 +171,19 @@ class StandardisedMlp(Mlp):
         return self.scale_out.restore(self.output(x))
 
     def outputs_and_variances(
-        self, inputs: Float[Array, "*batch n"], *, rngs: nnx.Rngs | None = None
+        self,
+        inputs: Float[Array, "*batch n"],
+        *,
+        rngs: nnx.Rngs | None = None,
+        apart: bool = False,
     ) -> tuple[Float[Array, "*batch m"], Float[Array, "*batch m"]]:
         """Outputs, and the variances of their errors in units of their squared spread.
+
+        Args:
+            inputs: Of the network.
+            rngs: Random streams of the dropout; None: without.
+            apart: Whether derivatives of the variances stop at the hidden layers, as in training:
+                what predicts the scatter must not make them worse at predicting the outputs.
 
         Raises:
             InputError: If the network has no layer for the variances.
@@ -183,9 +193,8 @@ class StandardisedMlp(Mlp):
                 "This network does not predict the variance of its errors: train an ensemble."
             )
         x = self.last_hidden(self.scale_in.standardise(inputs), rngs=rngs)
-        # What predicts the scatter must not make the hidden layers worse at predicting the outputs.
         # Bounded, so that no step of the training can make it overflow.
-        exponent = self.scatter(jax.lax.stop_gradient(x)) / _LARGEST_EXPONENT
+        exponent = self.scatter(jax.lax.stop_gradient(x) if apart else x) / _LARGEST_EXPONENT
         variances = _USUAL_VARIANCE * jnp.exp(_LARGEST_EXPONENT * jnp.tanh(exponent))
         return self.scale_out.restore(self.output(x)), variances
 

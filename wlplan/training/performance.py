@@ -72,7 +72,7 @@ def performance_loss(
     """
     if head.scatter is None:
         return jnp.mean(loss_of_errors(head.in_spreads(head(features, rngs=rngs) - wanted), loss))
-    predicted, variances = head.outputs_and_variances(features, rngs=rngs)
+    predicted, variances = head.outputs_and_variances(features, rngs=rngs, apart=True)
     errors = head.in_spreads(predicted - wanted)
     unlikely = jnp.log(variances) + jax.lax.stop_gradient(errors) ** 2 / variances
     return jnp.mean(loss_of_errors(errors, loss)) + _SCATTER * jnp.mean(0.5 * unlikely)
