@@ -213,7 +213,8 @@ def test_the_gradient_of_mean_and_deviation_is_that_of_finite_differences() -> N
         point = np.asarray(ACTION, np.float64)
 
         def of(action: jax.Array) -> jax.Array:
-            return with_deviation(model, view, action)
+            both: jax.Array = with_deviation(model, view, action)
+            return both
 
         exact = np.asarray(jax.jacfwd(of)(jnp.asarray(point)))
         steps = 1e-5 * np.eye(4)
