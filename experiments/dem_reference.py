@@ -54,7 +54,7 @@ MACHINE = dataclasses.replace(
     tilt_moment=220e3,
     bucket_heaped=3.05,
 )
-_UNITS = {"mass": "t", "time": "s", "work": "kJ"}
+UNITS = {"mass": "t", "time": "s", "work": "kJ"}
 _ACTION = [field.name for field in dataclasses.fields(Action)]
 # Soil slides in from beyond the local map: it is carried on by this many cells while it does.
 _MARGIN = 10
@@ -183,7 +183,8 @@ def _rank_correlation(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.corrcoef(first, second)[0, 1])
 
 
-def _agreement(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
+def agreement(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
+    """Bias, rank correlation, and differences relative to the reference, over cycles."""
     return {
         "bias": float(ours.mean() / theirs.mean() - 1.0),
         "bias_of_median": float(np.median(ours) / np.median(theirs) - 1.0),
@@ -204,7 +205,7 @@ def _compared_forces(led: dict[str, np.ndarray], mass: np.ndarray) -> dict[str, 
             "rms_difference_kN": float(np.sqrt(((ours - theirs) ** 2).mean())),
             "correlation": float(np.corrcoef(ours, theirs)[0, 1]),
         }
-    return result | {"load_at_the_stop": _agreement(led["load"], mass)}
+    return result | {"load_at_the_stop": agreement(led["load"], mass)}
 
 
 def _of_part(path: Path, count: int | None) -> dict[str, Any]:
@@ -215,7 +216,7 @@ def _of_part(path: Path, count: int | None) -> dict[str, Any]:
         # The reference counts thrust times vehicle speed, boom and bucket, without slip.
         "work": np.asarray(cycle.work_drive + cycle.work_boom + cycle.work_bucket) / J_PER_KJ,
     }
-    theirs = {name: reference[f"{name}_{unit}"] for name, unit in _UNITS.items()}
+    theirs = {name: reference[f"{name}_{unit}"] for name, unit in UNITS.items()}
     stops = [STOP_REASONS[int(k)] for k in cycle.stop_reason]
     volume = misplaced(slid(cycle.height), reference["h1_cg"])
     first = reference["packing"] == 0
@@ -223,10 +224,10 @@ def _of_part(path: Path, count: int | None) -> dict[str, Any]:
     return {
         "cycles": len(volume),
         "piles": len(set(reference["pile_id"].tolist())),
-        "agreement": {name: _agreement(ours[name], theirs[name]) for name in ours},
+        "agreement": {name: agreement(ours[name], theirs[name]) for name in ours},
         # Repeats of one surface and action are no more evidence than one of them.
         "agreement_each_surface_once": {
-            name: _agreement(ours[name][first], theirs[name][first]) for name in ours
+            name: agreement(ours[name][first], theirs[name][first]) for name in ours
         },
         "misplaced_m3": {"mean": float(volume.mean()), "median": float(np.median(volume))},
         "stalls": {
@@ -273,11 +274,11 @@ def _repeats(
                     np.abs(reference[f"{name}_{unit}"][i] / reference[f"{name}_{unit}"][j] - 1)
                 )
             )
-            for name, unit in _UNITS.items()
+            for name, unit in UNITS.items()
         },
         "median_relative_difference_ours": {
             name: float(np.median(np.abs(ours[name] / reference[f"{name}_{unit}"] - 1.0)[members]))
-            for name, unit in _UNITS.items()
+            for name, unit in UNITS.items()
         },
     }
 
@@ -287,7 +288,7 @@ def _scatter(reference: dict[str, np.ndarray]) -> dict[str, Any]:
 
     What `wlplan.worlds.scattered` draws from.
     """
-    logarithms = np.log(np.stack([reference[f"{n}_{u}"] for n, u in _UNITS.items()], axis=1))
+    logarithms = np.log(np.stack([reference[f"{n}_{u}"] for n, u in UNITS.items()], axis=1))
     apart, freedom = [], 0
     for surface in np.unique(reference["pile_id"]):
         members = reference["pile_id"] == surface
@@ -299,13 +300,13 @@ def _scatter(reference: dict[str, np.ndarray]) -> dict[str, Any]:
         if repeats and not (reference["stop_reason"][members] == "timeout").any():
             apart.append(logarithms[members] - logarithms[members].mean(axis=0))
             freedom += packings - 1
-    all_of_them = np.concatenate(apart or [np.zeros((0, len(_UNITS)))])
+    all_of_them = np.concatenate(apart or [np.zeros((0, len(UNITS)))])
     covariance = all_of_them.T @ all_of_them / max(freedom, 1)
     deviation = np.sqrt(np.diag(covariance))
     return {
         "surfaces": len(apart),
         "cycles": len(all_of_them),
-        "deviation": dict(zip(_UNITS, deviation.tolist(), strict=True)),
+        "deviation": dict(zip(UNITS, deviation.tolist(), strict=True)),
         "correlation": (covariance / np.maximum(np.outer(deviation, deviation), 1e-12)).tolist(),
     }
 
@@ -323,7 +324,7 @@ def _trends(parts: dict[Path, dict[str, Any]], count: int | None) -> dict[str, A
     result: dict[str, Any] = {"cycles": int(moves.sum())}
     for who in ("ours", "reference"):
         mass, time, work = (
-            np.concatenate([part[who][name] for part in parts.values()])[moves] for name in _UNITS
+            np.concatenate([part[who][name] for part in parts.values()])[moves] for name in UNITS
         )
         causes = {"time": time, **dict(zip(_ACTION, action[moves].T, strict=True))}
         effects = {"productivity": mass / time, "work_per_tonne": work / mass}
@@ -356,7 +357,7 @@ def draw(folder: Path) -> None:
     result = json.loads((folder / "dem_reference.json").read_text())
     figure = Figure(figsize=(9.6, 6.4), layout="constrained")
     axes = figure.subplots(2, 3)
-    for axis, (name, unit) in zip(axes[0], _UNITS.items(), strict=True):
+    for axis, (name, unit) in zip(axes[0], UNITS.items(), strict=True):
         drawn = []
         for part, colour, label in (
             ("fitted", _FITTED_COLOUR, "fitted to"),
@@ -366,10 +367,10 @@ def draw(folder: Path) -> None:
             axis.plot(theirs, ours, "o", ms=4, color=colour, label=label)
             drawn += [*ours, *theirs]
         axis.plot([min(drawn), max(drawn)], [min(drawn), max(drawn)], color="#999999", lw=1)
-        agreement = result["held_out"]["agreement_each_surface_once"][name]
+        found = result["held_out"]["agreement_each_surface_once"][name]
         axis.set_title(
-            f"{name}, held out: bias {100 * agreement['bias']:+.1f} %, "
-            f"ranks {agreement['rank_correlation']:.2f}",
+            f"{name}, held out: bias {100 * found['bias']:+.1f} %, "
+            f"ranks {found['rank_correlation']:.2f}",
             fontsize=9,
         )
         axis.set_xlabel(f"discrete elements [{unit}]")

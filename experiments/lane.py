@@ -20,7 +20,8 @@ import numpy as np
 import wlplan
 from experiments._common.places import say
 from experiments._common.results import main
-from experiments.dem_reference import MACHINE
+from experiments.dem_reference import MACHINE, UNITS, agreement
+from wlplan.constants import CELL_SIZE, J_PER_KJ
 from wlplan.engines.simulator import STOP_REASONS, Simulator
 from wlplan.io import write_bytes_atomic
 from wlplan.planning.planners import Greedy
@@ -40,7 +41,6 @@ SLOPE_DEGREES, LOADS, SEEDS = 30.0, 30, (1, 2)
 _STALL = 17.0
 # A load counts as another where its mass differs by more than this part.
 _ANOTHER = 0.02
-_UNITS = {"mass": "t", "time": "s", "work": "kJ"}
 _COLOURS = {"meets": "#1f5fa8", "free": "#b9c4d0"}
 
 
@@ -64,10 +64,10 @@ def replay(cycles: dict[str, np.ndarray], *, lane_soil: bool) -> dict[str, np.nd
 
     @jax.jit
     def one(height: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-        pile = Pile(height, 0.1, jnp.asarray(cycles["first"]))
+        pile = Pile(height, CELL_SIZE, jnp.asarray(cycles["first"]))
         _, performance, cycle = simulator.play(pile, pose, action_from(action))
         # The reference counts thrust times vehicle speed, boom and bucket, without slip.
-        work = performance.work - cycle.work_slip / 1e3
+        work = performance.work - cycle.work_slip / J_PER_KJ
         return jnp.stack([performance.mass, performance.time, work]), cycle.stop_reason
 
     played = [
@@ -76,16 +76,7 @@ def replay(cycles: dict[str, np.ndarray], *, lane_soil: bool) -> dict[str, np.nd
     ]
     numbers = np.array([row for row, _ in played])
     stops = np.array([STOP_REASONS[int(stop)] for _, stop in played])
-    return dict(zip(_UNITS, numbers.T, strict=True)) | {"stop_reason": stops}
-
-
-def _beside(ours: np.ndarray, theirs: np.ndarray) -> dict[str, float]:
-    difference = ours / theirs - 1.0
-    return {
-        "bias": float(ours.mean() / theirs.mean() - 1.0),
-        "mean_relative_difference": float(np.abs(difference).mean()),
-        "median_relative_difference": float(np.median(np.abs(difference))),
-    }
+    return dict(zip(UNITS, numbers.T, strict=True)) | {"stop_reason": stops}
 
 
 def run(preset: str) -> dict[str, Any]:
@@ -96,13 +87,13 @@ def run(preset: str) -> dict[str, Any]:
         "meets": replay(cycles, lane_soil=True),
         "free": replay(cycles, lane_soil=False),
     }
-    theirs = {name: cycles[f"{name}_{unit}"] for name, unit in _UNITS.items()}
+    theirs = {name: cycles[f"{name}_{unit}"] for name, unit in UNITS.items()}
     held_out = np.arange(len(theirs["mass"])) >= (0 if preset == "smoke" else CHOSEN_ON)
     result: dict[str, Any] = {
         "cycles": len(theirs["mass"]),
         "held_out": int(held_out.sum()),
         "agreement_held_out": {
-            which: {n: _beside(played[n][held_out], theirs[n][held_out]) for n in _UNITS}
+            which: {n: agreement(played[n][held_out], theirs[n][held_out]) for n in UNITS}
             for which, played in ours.items()
         },
         "same_stop_reason": {
@@ -125,7 +116,7 @@ def run(preset: str) -> dict[str, Any]:
         "dem": {n: np.round(v.astype(float), 3).tolist() for n, v in theirs.items()}
         | {"stop_reason": cycles["stop_reason"].tolist()},
         **{
-            which: {n: np.round(played[n].astype(float), 3).tolist() for n in _UNITS}
+            which: {n: np.round(played[n].astype(float), 3).tolist() for n in UNITS}
             | {"stop_reason": played["stop_reason"].tolist()}
             for which, played in ours.items()
         },
@@ -136,10 +127,10 @@ def run(preset: str) -> dict[str, Any]:
         result["without_ridge"] = {
             "dem": {
                 n: np.round(without[f"{n}_{unit}"].astype(float), 3).tolist()
-                for n, unit in _UNITS.items()
+                for n, unit in UNITS.items()
             }
             | {"stop_reason": without["stop_reason"].tolist()},
-            "ours": {n: np.round(level[n].astype(float), 3).tolist() for n in _UNITS}
+            "ours": {n: np.round(level[n].astype(float), 3).tolist() for n in UNITS}
             | {"stop_reason": level["stop_reason"].tolist()},
         }
     result["plans"] = plans(preset)
@@ -165,7 +156,7 @@ def plans(preset: str) -> list[dict[str, Any]]:
             masses = {which: np.asarray(one.mass) for which, one in performance.items()}
             row: dict[str, Any] = {"pile": name, "seed": seed, "loads": len(masses["free"])}
             for which, one in performance.items():
-                row[which] = {n: round(float(getattr(one, n).sum()), 3) for n in _UNITS}
+                row[which] = {n: round(float(getattr(one, n).sum()), 3) for n in UNITS}
                 row[which]["stalls"] = int((np.asarray(one.time) > _STALL).sum())
             apart = np.abs(masses["meets"] / np.maximum(masses["free"], 1e-3) - 1.0)
             row["other_loads"] = int((apart > _ANOTHER).sum())
@@ -180,7 +171,7 @@ def draw(folder: Path) -> None:
 
     result = json.loads((folder / "lane.json").read_text())
     figure = Figure(figsize=(9.6, 3.4), layout="constrained")
-    for axis, (name, unit) in zip(figure.subplots(1, 3), _UNITS.items(), strict=True):
+    for axis, (name, unit) in zip(figure.subplots(1, 3), UNITS.items(), strict=True):
         theirs = result["dem"][name]
         drawn = list(theirs)
         for which, label in (("free", "lane taken as free"), ("meets", "lane met")):

@@ -24,7 +24,7 @@ from wlplan.report.exports import KINDS as EXPORTS
 from wlplan.site.machine import MACHINES
 from wlplan.site.soil import SOILS
 from wlplan.training.settings import KINDS, Setting, setting_of
-from wlplan.worlds.names import ENGINES, FOR_PLANNING
+from wlplan.worlds.names import ENGINES, FOR_PLANNING, USUAL_ENGINE
 
 # Names that the modules behind define, repeated here to keep help fast; a test compares them.
 PROTOCOLS = ("paper", "corridor", "slow", "past-toe")
@@ -296,7 +296,7 @@ planner_option = click.option(
 engine_option = click.option(
     "--engine",
     type=click.Choice(list(ENGINES)),
-    default=next(iter(ENGINES)),
+    default=USUAL_ENGINE,
     show_default=True,
     help="Engine that plays the plan: the simulator; the same with the soil that lies in the "
     "approach lane; or discrete elements, which take minutes a load and need wlplan[dem].",

@@ -49,7 +49,7 @@ from wlplan.errors import InputError
 from wlplan.planning.objectives import OBJECTIVES
 from wlplan.report.exports import check as check_exports
 from wlplan.report.exports import names as names_of_exports
-from wlplan.worlds.names import ENGINES
+from wlplan.worlds.names import USUAL_ENGINE
 
 if TYPE_CHECKING:
     from wlplan.planning.amounts import Amount
@@ -351,7 +351,7 @@ def simulate(
             progress(engine, count, count, None)
 
     predicted = _predicted_of(given)
-    by: dict[str, Any] = {} if engine == next(iter(ENGINES)) else {"engine": engine}
+    by: dict[str, Any] = {} if engine == USUAL_ENGINE else {"engine": engine}
     if scatter is not None:
         by["scatter"] = scatter
     document = plan_document(

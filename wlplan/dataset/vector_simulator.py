@@ -205,6 +205,10 @@ def _put(states: _States, slot: Int[Array, ""] | int, begun: State) -> _States:
     return tuple(all_.at[..., slot].set(new[..., 0]) for all_, new in pairs)
 
 
+def _get(simulator: Simulator, states: _States, slot: Int[Array, ""] | int) -> State:
+    return _unpack(simulator, tuple(part[..., slot][..., None] for part in states))
+
+
 def _go_on(
     simulator: Simulator,
     states: _States,
@@ -213,7 +217,7 @@ def _go_on(
     lane: Float[Array, "52 52"],
 ) -> tuple[_States, Float[Array, "52 52"]]:
     """The slots with one of them through its lane, and what that has changed there."""
-    one = _unpack(simulator, tuple(part[..., slot][..., None] for part in states))
+    one = _get(simulator, states, slot)
     main = _begin(simulator, view[..., None], one.action)
     begun, change = go_on(one, lane[..., None], main, simulator.machine)
     return _put(states, slot, begun), change[..., 0]
@@ -230,7 +234,7 @@ def _leave(
     lane: Float[Array, "52 52"],
 ) -> tuple[Float[Array, "nx ny"], dict[str, Array], Float[Array, " k"]]:
     """The surface after the loading of one slot, the local maps, and the numbers of `_named`."""
-    one = _unpack(simulator, tuple(part[..., slot][..., None] for part in states))
+    one = _get(simulator, states, slot)
     cycles = outcome(one, machine=simulator.machine, soil=simulator.soil)
     cycle = jax.tree.map(lambda part: part[..., 0], cycles)
     if simulator.lane_soil:

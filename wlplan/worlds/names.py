@@ -22,13 +22,14 @@ class Engine(NamedTuple):
 
     maker: str  # "module:name" of what makes it of `machine` and `soil`
     title: str  # as pages and tables say it
+    is_planned_in: bool = False  # whether commands plan in it, beside playing plans there
 
 
 WORLDS: dict[str, Learned | Engine] = {
     "low": Learned("psi_low"),
     "hybrid": Learned("psi_high"),
     "high": Learned("psi_high", "phi"),
-    "simulator": Engine("wlplan.engines.simulator:Simulator", "the simulator"),
+    "simulator": Engine("wlplan.engines.simulator:Simulator", "the simulator", True),
     "simulator-lane": Engine(
         "wlplan.engines.simulator:with_lane_soil", "the simulator with soil in the approach lane"
     ),
@@ -37,13 +38,17 @@ WORLDS: dict[str, Learned | Engine] = {
 """Worlds by name."""
 
 ENGINES = {name: world for name, world in WORLDS.items() if isinstance(world, Engine)}
-"""Those that play plans without having learnt; the first is the usual one."""
+"""Those that play plans without having learnt."""
 
-# The discrete elements take minutes a loading. The soil in the lane is for checking a plan.
-FOR_PLANNING = tuple(name for name in WORLDS if name not in ("dem", "simulator-lane"))
+USUAL_ENGINE = "simulator"
+"""What plays a plan that says nothing of an engine."""
+
+FOR_PLANNING = tuple(
+    name for name, world in WORLDS.items() if isinstance(world, Learned) or world.is_planned_in
+)
 """Names of the worlds that commands plan in."""
 
 
 def engine_of(document: Mapping[str, Any]) -> Engine:
     """What played a plan, by its `plan.json`; that names no engine where it was the usual one."""
-    return ENGINES.get(document.get("engine", ""), next(iter(ENGINES.values())))
+    return ENGINES.get(document.get("engine", USUAL_ENGINE), ENGINES[USUAL_ENGINE])
