@@ -141,6 +141,25 @@ def test_a_scan_is_dropped_and_planned(
     assert opened.errors == []
 
 
+def test_a_page_without_a_size_draws_nothing_and_comes_back(
+    browser: Any, served: Served, scan: Path
+) -> None:
+    opened = Opened(browser, served, 1400)
+    page = opened.page
+    page.set_input_files("#file", str(scan))
+    page.wait_for_selector("#map", state="visible")
+    page.mouse.click(*opened.point(-10.0, 4.0))
+    before = page.locator("#flipped").get_attribute("transform")
+    # A tab behind another is told of a size of zero.
+    resized = "display => {map.style.display = display; dispatchEvent(new Event('resize'))}"
+    page.evaluate(resized, "none")
+    page.locator("#truck-x").fill("-9")
+    page.evaluate(resized, "")
+    assert opened.errors == []
+    assert page.locator("#flipped").get_attribute("transform") == before
+    assert page.locator("#truck rect").count() + page.locator("#truck circle").count() > 0
+
+
 def test_all_of_it_works_by_keyboard(browser: Any, served: Served, scan: Path) -> None:
     opened = Opened(browser, served, 1400)
     page = opened.page

@@ -139,6 +139,8 @@
   const local = ([x, y]) => [x - state.box.x, y - state.box.y];
   function whole() {
     const { clientWidth: w, clientHeight: h } = map, box = state.box;
+    // A tab behind another may have no size; it is told when it has one again.
+    if (!w || !h) return;
     // Trucks often stand beside the scan.
     const scale = Math.max((box.w + 2 * BESIDE) / w, (box.h + 2 * BESIDE) / h);
     view = { x: 0.5 * (box.w - scale * w), y: 0.5 * (box.h - scale * h), scale };
@@ -344,7 +346,7 @@
     event.preventDefault();
     drawAll();
   });
-  for (const name of ["focus", "blur"]) map.addEventListener(name, () => state.scan && drawCross());
+  for (const name of ["focus", "blur"]) map.addEventListener(name, () => view && drawCross());
   at("closer").addEventListener("click", () => zoom(1 / 1.4));
   at("further").addEventListener("click", () => zoom(1.4));
   at("whole").addEventListener("click", () => { whole(); drawAll(); });
