@@ -82,7 +82,7 @@ def run(preset: str) -> dict[str, Any]:
         "greedy, its own spot": _Case(greedy, truck=own),
         "best planner, its own spot": _Case(best, truck=own, in_referee=True),
     }
-    made_with = {"wlplan": wlplan.__version__, "amount": repr(amount), "cases": repr(cases)}
+    made_with = {"amount": repr(amount), "cases": repr(cases)}
     kept = None if smoke else Rows(ROWS, made_with)
     rows = []
     for kind, name in itertools.product(KINDS[:1] if smoke else KINDS, cases):

@@ -17,6 +17,7 @@ import wlplan
 from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.io import write_bytes_atomic
+from wlplan.parallel import ParallelMap
 from wlplan.planning.amounts import Loads
 from wlplan.planning.job import Job, beginning, make_job, with_toe
 from wlplan.planning.load_search import quick_ways
@@ -30,7 +31,6 @@ from wlplan.planning.playing import (
 from wlplan.planning.watch import EFFORTS, Watch
 from wlplan.report.figures import png_bytes
 from wlplan.report.figures.style import BLUE, ORANGE, new_figure, tidy
-from wlplan.xla import ParallelMap
 
 LOADS, PLANS, REPEATS = 15, 16, 5
 

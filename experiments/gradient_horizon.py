@@ -16,13 +16,13 @@ from experiments._common.places import say
 from experiments._common.results import main
 from wlplan.constants import ACTION_HIGH, ACTION_LOW
 from wlplan.io import write_bytes_atomic
+from wlplan.parallel import ParallelMap
 from wlplan.planning.job import Decisions, Job, make_job, with_toe
 from wlplan.planning.playing import outcomes
 from wlplan.report.figures import png_bytes
 from wlplan.studies.gradcheck import as_table, cost_and_gradient
 from wlplan.types import LoadingPlan
 from wlplan.worlds.capabilities import with_derivatives
-from wlplan.xla import ParallelMap
 
 # A cone that holds twice what 100 loadings take: a bucket that comes back empty from the last of a
 # pile has a large gradient of its own.

@@ -41,6 +41,7 @@ from experiments._common.row_files import (
     part_of,
     time_is_up,
 )
+from experiments._common.rows import of_package
 from wlplan.cli.progress import Stopwatch
 from wlplan.errors import InputError
 from wlplan.io import write_bytes_atomic, write_text_atomic
@@ -208,7 +209,7 @@ def place_truck(instance: Instance, seed: int, folder: Path) -> Receiver | None:
 def made_with(run: Run, planner: Planner) -> dict[str, str]:
     """What a row hangs on; one that was made with anything else is made anew."""
     return {
-        "wlplan": wlplan.__version__,
+        **of_package(),
         "planner": repr(planner),
         "amount": repr(run.instance.amount),
         "efforts": json.dumps(EFFORTS),
@@ -440,7 +441,7 @@ def _make(options: argparse.Namespace, folder: Path) -> None:
         mine = set(part_of(places, options.shard))
         mine_alone = [r for r in todo if (r.instance, r.seed) in mine]
         work(mine_alone, made, shown, time_is_up(options))
-    rows = made.all()
+    rows = [row for row in made.all() if of_package().items() <= row["made_with"].items()]
     # The best plans known so far: those in the folder, or else the committed ones.
     committed = [] if options.preset == "smoke" else [RESULTS / BEST]
     known = next((path for path in (folder / BEST, *committed) if path.exists()), None)

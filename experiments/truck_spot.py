@@ -74,7 +74,7 @@ def run(preset: str) -> dict[str, Any]:
         asked += [(name, kind, TRUCKS) for kind in kinds]
         if smoke or name in MANY_ON:
             asked += [(name, kind, MANY_TRUCKS) for kind in ("auto", "auto, one by one", "each")]
-    made_with = {"wlplan": wlplan.__version__, "planner": repr(planner), "payload": PAYLOAD}
+    made_with = {"planner": repr(planner), "payload": PAYLOAD}
     kept = None if smoke else Rows(ROWS, made_with)
     rows = []
     for name, kind, trucks in asked:

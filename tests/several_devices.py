@@ -14,13 +14,13 @@ from cones import SITE, bowl_world, cone
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import wlplan
+from wlplan.parallel import ParallelMap
 from wlplan.planning.amounts import Loads
 from wlplan.planning.job import make_job
 from wlplan.planning.planners import Greedy
 from wlplan.planning.playing import costs_and_gradients, cusps_of_plans, outcomes, play_candidate
 from wlplan.planning.rollout import rollout
 from wlplan.types import Action, LoadingPlan, Pose
-from wlplan.xla import ParallelMap
 
 DEVICES = 4
 # Sums in another order.

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from jax.typing import DTypeLike
 
-from wlplan.xla import ParallelMap, cores, materialize, materialize_if
+from wlplan.parallel import ParallelMap
+from wlplan.xla import cores, materialize, materialize_if
 
 
 def shifted(shared: jax.Array, row: dict[str, jax.Array]) -> dict[str, jax.Array]:

@@ -19,13 +19,13 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from wlplan.parallel import ParallelMap
 from wlplan.planning.job import Decisions, Job, contour_length
 from wlplan.planning.placement import place_of, receiver_at
 from wlplan.planning.playing import play_candidate
 from wlplan.planning.spots import at_receiver
 from wlplan.planning.watch import Watch
 from wlplan.site.receiver import Receiver
-from wlplan.xla import ParallelMap
 
 # First steps: of the place [m], of the heading there [rad], of digs along the toe [m], of their
 # headings and actions before squashing.

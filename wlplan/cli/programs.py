@@ -1,9 +1,10 @@
 """Compiled programs, kept from one run of the command line to the next.
 
-JAX can load again what it compiled before. On CPUs it does not look closely whether what it loads
-is right for the processor and for the XLA at hand: a program that is not ends the process. So the
-programs lie in a folder of the user's alone, one for each processor and each set of versions, and
-are dropped if a process that used them did not come to its end.
+JAX can load again what it compiled before, and `wlplan.traced` what was traced. On CPUs JAX does
+not look closely whether what it loads is right for the processor and for the XLA at hand: a program
+that is not ends the process. So the programs lie in a folder of the user's alone, one for each
+processor and each set of versions, and are dropped if a process that used them did not come to its
+end.
 """
 
 from __future__ import annotations
@@ -43,6 +44,10 @@ _TRIED = ((0, 8), (0, 10))
 # Before this XLA may overflow its stack as it loads a large program on a Mac.
 _ON_A_MAC = (0, 10)
 
+# Of the files of JAX, and of `wlplan.traced`, which cannot be imported before JAX is set up.
+_ENDINGS = ("-cache", ".stablehlo")
+_TRACES = "WLPLAN_TRACES"
+
 _KEY, _FAULTS, _RUNNING, _TIMES = "made_with.json", "cut_short", "running", "times.json"
 
 
@@ -59,10 +64,10 @@ class Cache:
     reason: str = ""
 
     def programs(self) -> list[Path]:
-        """The files of the programs."""
+        """The files of the programs, compiled and traced."""
         if self.folder is None or not self.folder.is_dir():
             return []
-        return sorted(path for path in self.folder.iterdir() if path.name.endswith("-cache"))
+        return sorted(path for path in self.folder.iterdir() if path.name.endswith(_ENDINGS))
 
     def seconds(self, what: str) -> float | None:
         """How long something took to compile when it last did [s]; None if that is not known."""
@@ -206,7 +211,7 @@ def _used(folder: Path) -> Cache:
     mark.acquire(timeout=0)
     _ends.append(functools.partial(_at_the_end, folder, mark, os.getpid()))
     atexit.register(end)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ[_TRACES] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(_QUICK))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
     return Cache(folder)

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from wlplan.parallel import ParallelMap
 from wlplan.planning.driving import Room, room_of
 from wlplan.planning.lane import lane_touching
 from wlplan.planning.search import Cusps
@@ -20,7 +21,6 @@ from wlplan.site.machine import WheelLoader
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
 from wlplan.types import Pile, Pose
-from wlplan.xla import ParallelMap
 
 # Ways that one core looks for at a time.
 _PORTION = 8

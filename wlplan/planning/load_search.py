@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +12,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from wlplan.actions import spread_actions
+from wlplan.parallel import ParallelMap
 from wlplan.planning.amounts import Outlook, Trucks
 from wlplan.planning.descent import descend
 from wlplan.planning.good_ways import good_ways
@@ -21,8 +21,9 @@ from wlplan.planning.poses import Toe, pose_at
 from wlplan.planning.search import Cusps
 from wlplan.planning.stepping import next_load, score_of, score_of_next
 from wlplan.planning.watch import Watch
+from wlplan.traced import traced
 from wlplan.types import Pile, Pose
-from wlplan.xla import ParallelMap, floats
+from wlplan.xla import floats
 
 
 class Tried(NamedTuple):
@@ -284,7 +285,7 @@ def quick_ways(job: Job, pile: Pile, positions: Float[np.ndarray, " p"]) -> Cusp
     return good_ways(pile, job.yard, job.site.machine, poses, receivers).cusps
 
 
-@jax.jit
+@traced()
 def _square_to_toe(toe: Toe, pile: Pile, positions: Float[Array, " p"]) -> Pose:
     poses: Pose = jax.vmap(lambda at: pose_at(toe, pile, at, jnp.zeros_like(at)))(positions)
     return poses
@@ -315,7 +316,7 @@ def _outlook(good: _Load, full: _Load, spare: float, price: float = 0.0) -> Outl
     return Outlook(*(floats(np.asarray(number)) for number in (*good, *full, spare, price)))
 
 
-@jax.jit
+@traced()
 def _cost_and_mass(
     job: Job, standing: Standing, decisions: Decisions, cusps: Cusps
 ) -> tuple[Array, Array]:
@@ -338,14 +339,14 @@ def _scores(
     return found[: costs.size].reshape(costs.shape)
 
 
-@jax.jit
+@traced()
 def _scores_of(
     job: Job, standing: Standing, costs: Array, masses: Array, outlook: Outlook
 ) -> Float[Array, " n"]:
     return jax.vmap(lambda cost, mass: score_of(job, standing, cost, mass, outlook))(costs, masses)
 
 
-@functools.partial(jax.jit, static_argnames=("steps", "rate"))
+@traced(static_argnames=("steps", "rate"))
 def refined_loads(
     job: Job,
     standing: Standing,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple, no_type_check
 
@@ -12,6 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from wlplan.parallel import Ahead, ParallelMap
 from wlplan.planning.amounts import MISFIT_COST, Done, Loads
 from wlplan.planning.driving import Way, room_of
 from wlplan.planning.job import Decisions, Job, Standing, beginning, decided
@@ -24,6 +24,7 @@ from wlplan.planning.yard import packed_soil
 from wlplan.site.receiver import Receiver
 from wlplan.terrain.characteristics import characteristics
 from wlplan.terrain.heightmap import sample_local
+from wlplan.traced import traced
 from wlplan.types import (
     Characteristics,
     LoadingPlan,
@@ -34,7 +35,7 @@ from wlplan.types import (
     World,
 )
 from wlplan.worlds.capabilities import FORESIGHT, can
-from wlplan.xla import Ahead, ParallelMap, on_device
+from wlplan.xla import on_device
 
 
 @no_type_check
@@ -103,7 +104,7 @@ OF_LOADS = (
 """Fields of a result, beside plan and performance, whose leaves have an axis of loads."""
 
 
-@functools.partial(jax.jit, static_argnames="thorough")
+@traced(static_argnames=("thorough",))
 def assess(
     job: Job,
     standing: Standing,
@@ -234,13 +235,13 @@ def _played(world: Any, pile: Pile, one: LoadingPlan, *, report: bool) -> Played
     return Played(after, performance, known)
 
 
-@jax.jit
+@traced()
 def played_at(world: Any, pile: Pile, one: LoadingPlan) -> Played:
     """A loading at its pose; one that goes to no truck (-1) is not made."""
     return _played(world, pile, one, report=True)
 
 
-_decided = jax.jit(decided)
+_decided = traced()(decided)
 
 
 def play_one(

@@ -17,6 +17,7 @@ import numpy as np
 
 from wlplan.checks import is_traced
 from wlplan.errors import InputError
+from wlplan.parallel import ParallelMap
 from wlplan.planning.amounts import Amount, Done, Loads, Trucks, nothing_done
 from wlplan.planning.job import (
     Decisions,
@@ -33,7 +34,7 @@ from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
 from wlplan.types import Pile, World
 from wlplan.worlds.capabilities import as_pytree
-from wlplan.xla import ParallelMap, on_device
+from wlplan.xla import on_device
 
 EXTENT = 40.0
 """Sides of the largest scan, unless another is given [m]."""

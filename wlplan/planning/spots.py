@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from wlplan.actions import spread_actions, squash
+from wlplan.parallel import ParallelMap
 from wlplan.planning.job import Job, beginning
 from wlplan.planning.loading import Loading, Transport
 from wlplan.planning.placement import (
@@ -32,7 +33,6 @@ from wlplan.site.receiver import Receiver
 from wlplan.terrain.toe import edge_poses, toe_contour
 from wlplan.types import LoadingPlan, Pose
 from wlplan.worlds.capabilities import foresee
-from wlplan.xla import ParallelMap
 
 # Digs along the toe, actions at each, and by how many digs, the best, a spot is judged, of so many
 # that are looked at.

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from wlplan.actions import spread_actions, squash
 from wlplan.checks import check_action, check_pile, check_world
 from wlplan.errors import InputError
+from wlplan.parallel import ParallelMap
 from wlplan.planning.descent import descend
 from wlplan.planning.job import Job, can_refine
 from wlplan.planning.loading import Loading
@@ -33,7 +34,6 @@ from wlplan.studies.map_costs import Judged, cusps_of, job_of, judged, room_arou
 from wlplan.terrain.toe import ToeContour
 from wlplan.types import Action, Performance, Pile, Pose, World, action_from, action_vector
 from wlplan.worlds.capabilities import foresee
-from wlplan.xla import ParallelMap
 
 # Load below which time / mass is held finite [tonne], as in the terms of the planners.
 _LEAST_MASS = 0.1

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from wlplan.parallel import ParallelMap
 from wlplan.planning.amounts import Loads, Outlook
 from wlplan.planning.job import Decisions, Job, Standing, beginning, judged, padded, stacked
 from wlplan.planning.load_search import LoadSearch, Memory, Tried
@@ -19,8 +20,8 @@ from wlplan.planning.proposals import NothingWorthIt, Progress, Proposals
 from wlplan.planning.search import Cusps
 from wlplan.planning.stepping import made, score_of_played
 from wlplan.planning.watch import Watch, watching
+from wlplan.traced import Traced
 from wlplan.types import Pile
-from wlplan.xla import ParallelMap
 
 
 class Chosen(NamedTuple):
@@ -179,6 +180,6 @@ def _score_as_played(
     return score, played.pile, played.performance.mass
 
 
-_score_of_played = jax.jit(score_of_played)
+_score_of_played = Traced(score_of_played)
 _scores_as_played = ParallelMap(_score_as_played, on_core=_score_as_played)
-_made = jax.jit(made)
+_made = Traced(made)

@@ -12,6 +12,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
+from wlplan.parallel import ParallelMap
 from wlplan.planning.amounts import Done, Outlook, Trucks
 from wlplan.planning.descent import descend
 from wlplan.planning.job import Decisions, Job, Standing, can_refine, contour_length
@@ -19,7 +20,6 @@ from wlplan.planning.load_search import Tried
 from wlplan.planning.planners.greedy import Chosen, Greedy
 from wlplan.planning.stepping import advance, score_of, score_of_next
 from wlplan.planning.watch import Watch
-from wlplan.xla import ParallelMap
 
 
 class _Node(NamedTuple):
