@@ -69,6 +69,8 @@ def test_what_was_traced_is_not_traced_again(folder: Path) -> None:
     assert len(list(folder.iterdir())) == 1
     assert type(again[1]) is Scaled
     assert again[1].factor == 2.0
+    # Else all that is called with it would be compiled anew.
+    assert not any(leaf.committed for leaf in jax.tree.leaves(again))
     jax.tree.map(np.testing.assert_array_equal, first, again)
     jax.tree.map(np.testing.assert_array_equal, jax.jit(yields)(one), again)
     np.testing.assert_array_equal(

@@ -145,7 +145,16 @@ def _program(call: _Call, folder: Path, leaves: Sequence[Any]) -> Callable[..., 
 
     # As profiles have it.
     run.__name__ = getattr(call.function, "__name__", "run")
-    return jax.jit(run)
+    compiled = jax.jit(run)
+
+    def free(*leaves: Any) -> Any:
+        # JAX has what comes of a kept trace committed to its device, and would compile all anew
+        # that is called with it. On a CPU nothing is copied here. Other threads go on meanwhile,
+        # as they would not while numpy waits.
+        done = jax.block_until_ready(compiled(*leaves))
+        return jax.device_put(jax.tree.map(np.asarray, done))
+
+    return free
 
 
 # --- files: classes of the result, check sum, program

@@ -8,6 +8,7 @@ come at once.
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import sys
@@ -93,6 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if "_WLPLAN_COMPLETE" in os.environ:  # the shell asks for completions
         wlplan.main(prog_name="wlplan")
     words = list(sys.argv[1:] if arguments is None else arguments)
+    # Tracing makes objects by the million and hardly a cycle: looking for them takes a twentieth.
+    gc.set_threshold(100_000, 20, 20)
     with warnings.catch_warnings():
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
