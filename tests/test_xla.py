@@ -1,6 +1,8 @@
 """Rows mapped in parallel are as one after the other, and a materialized array is as it was."""
 
 import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -83,3 +85,39 @@ def test_what_is_not_wanted_is_filled() -> None:
 
 def test_at_least_one_core_is_there() -> None:
     assert 1 <= cores() <= (os.cpu_count() or 1)
+
+
+# Compiles for two seconds in a thread, one thing after another, and ends meanwhile.
+ENDS = """
+import sys, time
+import jax, jax.numpy as jnp
+from wlplan.parallel import Ahead, is_compiling_ahead
+begun = []
+
+def several():
+    until = time.monotonic() + 2.0
+    while time.monotonic() < until:
+        begun.append(1)
+        jax.jit(lambda x: x + len(begun))(jnp.ones(3))
+
+Ahead().run(several)
+while not begun:
+    time.sleep(0.01)
+assert is_compiling_ahead()
+{}
+"""
+
+
+@pytest.mark.parametrize(
+    ("ending", "code"),
+    [
+        ("sys.exit(5)", 5),
+        ("from wlplan import cli; sys.argv[1:] = ['plan', '--loads', 'x']; cli.run()", 2),
+    ],
+)
+def test_a_process_that_ends_while_it_compiles_ends_well(ending: str, code: int) -> None:
+    program = ENDS.format(ending)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr.count("\n")) == (code, int(code == 2)), done.stderr

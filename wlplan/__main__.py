@@ -1,8 +1,6 @@
 """`python -m wlplan`: the same as the command `wlplan`."""
 
-import sys
-
-from wlplan.cli import main
+from wlplan.cli import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run()

@@ -25,6 +25,15 @@ from wlplan.xla import cores
 _ROWS = "rows"
 
 
+# The name of threads that compile.
+_AHEAD = "wlplan compiles ahead"
+
+
+def is_compiling_ahead() -> bool:
+    """Whether something is compiled ahead; a process that ends then waits, or uses `os._exit`."""
+    return any(thread.name == _AHEAD for thread in threading.enumerate())
+
+
 class ParallelMap:
     """A compiled `function(shared, row)`, mapped over rows in parallel.
 
@@ -107,7 +116,8 @@ class ParallelMap:
 class Ahead:
     """Has something compiled in a thread of its own, while there is other work.
 
-    Who needs it waits, since what two threads ask for at once is compiled twice.
+    Who needs it waits, since what two threads ask for at once is compiled twice. A process waits
+    for it too before it ends: XLA would end it by a fault in the middle of compiling.
     """
 
     def __init__(self) -> None:
@@ -122,7 +132,7 @@ class Ahead:
             with contextlib.suppress(Exception), jax.enable_x64(double):
                 call()
 
-        self._thread = threading.Thread(target=quietly, daemon=True)
+        self._thread = threading.Thread(target=quietly, name=_AHEAD)
         self._thread.start()
 
     def wait(self) -> None:

@@ -15,6 +15,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from typing import NoReturn
 
 import click
 
@@ -132,6 +133,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 f"WLPLAN_DEBUG=1 shows where.",
                 1,
             )
+
+
+def run() -> NoReturn:
+    """The command line as a process, which does not wait for what nobody needs any more."""
+    code = main()
+    compiling = getattr(sys.modules.get("wlplan.parallel"), "is_compiling_ahead", None)
+    if compiling is not None and compiling():
+        programs.end()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def _fail(message: str, code: int) -> int:
