@@ -11,6 +11,7 @@ import contextlib
 import gc
 import logging
 import os
+import signal
 import sys
 import traceback
 import warnings
@@ -136,7 +137,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run() -> NoReturn:
-    """The command line as a process, which does not wait for what nobody needs any more."""
+    """The command line as a process, which SIGTERM ends as Ctrl-C does.
+
+    It does not wait for what is still compiled, which nobody needs any more.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     code = main()
     compiling = getattr(sys.modules.get("wlplan.parallel"), "is_compiling_ahead", None)
     if compiling is not None and compiling():
