@@ -78,7 +78,11 @@ def run_shell(example: Example) -> None:
     }.items():
         (tools / name).write_text(f'#!/bin/sh\nexec {command} "$@"\n')
         (tools / name).chmod(0o755)
+    traces = ROOT / ".pytest_cache" / "traces"
+    traces.mkdir(parents=True, exist_ok=True)
     paths = {"PATH": f"{tools}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    # Each command is a process; users keep what was traced, too.
+    paths["WLPLAN_TRACES"] = str(traces)
     done = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", text],
         stdout=subprocess.PIPE,
