@@ -1,6 +1,7 @@
 """Traces that are kept: used for the same call and no other, never of foreign code."""
 
 import dataclasses
+import functools
 import math
 import os
 import subprocess
@@ -134,7 +135,18 @@ class _Odd(float):
 def test_names_are_those_of_one_thing() -> None:
     assert name_of(Performance) == "wlplan.types:Performance"
     assert plain(jax.nn.swish) != plain(jax.nn.relu)
-    for foreign in (lambda: 0, yields, Path, _Odd(1.0), object(), {"a": lambda: 0}, [Path()]):
+    parts = [functools.partial(jax.nn.gelu, approximate=one) for one in (True, False)]
+    assert len({name_of(part) for part in (*parts, jax.nn.gelu)}) == 3
+    for foreign in (
+        lambda: 0,
+        functools.partial(yields),
+        yields,
+        Path,
+        _Odd(1.0),
+        object(),
+        {"a": lambda: 0},
+        [Path()],
+    ):
         with pytest.raises(NamelessError):
             plain(foreign)
     different = [0, False, 0.0, -0.0, "0", None, (), [], {}, np.float32(0), np.float64(0)]

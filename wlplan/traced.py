@@ -234,9 +234,13 @@ def _source() -> str:
 def name_of(one: Any) -> str:
     """Module and name of a class or function, where it is what is found under them.
 
+    Of a part of a function the arguments that it has, too.
+
     Raises:
         NamelessError: If it is not: one made in a function, or of a package that is not known.
     """
+    if isinstance(one, functools.partial):
+        return json.dumps([name_of(one.func), plain(one.args), plain(one.keywords)])
     name = f"{getattr(one, '__module__', '')}:{getattr(one, '__qualname__', '')}"
     if one is not type(None) and inspect.unwrap(_object(name)) is not inspect.unwrap(one):
         raise NamelessError
