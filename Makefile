@@ -67,7 +67,7 @@ test-slow: $(VENV)/.engine
 	$(BIN)/python -m pytest -m slow || { code=$$?; test $$code -eq 5 && echo "there is no slow test"; }
 
 # What a user touches; other versions of the libraries show there first.
-EDGE_TESTS := $(addprefix tests/test_,package.py api.py outside.py io.py readers.py scans.py scan_formats.py exports.py programs.py planner.py rollout.py worlds.py)
+EDGE_TESTS := $(addprefix tests/test_,package.py api.py outside.py io.py readers.py scans.py scan_formats.py exports.py programs.py traced.py planner.py rollout.py worlds.py)
 NEWEST_PYTHON := $(shell for v in 3.14 3.13 3.12 3.11; do python$$v -c "" 2>/dev/null && command -v python$$v && break; done | head -n 1)
 
 $(VENV)-lowest/.tools: $(VENV)/.tools

@@ -241,3 +241,14 @@ def test_the_command_line_keeps_them(tmp_path: Path) -> None:
     assert [words[0] for words in said] == ["2", "0"]
     assert said[0][1] == said[1][1] == "2"
     assert int(said[1][2]) > 2
+
+
+def test_without_what_jax_writes_by_it_is_traced(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write(path: Path, program: Any) -> None:
+        raise ImportError("Please install 'flatbuffers'")
+
+    monkeypatch.setattr(kept, "write", write)
+    assert called(yields, Scaled(jnp.ones(2)))[0].mass.tolist() == [2.0, 2.0]
+    assert list(folder.iterdir()) == []

@@ -133,7 +133,8 @@ def _program(call: _Call, folder: Path, leaves: Sequence[Any]) -> Callable[..., 
         if kept is None:
             kept = call.lowered(leaves)
             write(path, kept)
-    except (NamelessError, ValueError, NotImplementedError):
+    except (NamelessError, ValueError, NotImplementedError, ImportError):
+        # The last: JAX writes by flatbuffers, which it does not install.
         return None
     except OSError:
         # It could not be written: then it is for this process alone.
@@ -183,7 +184,7 @@ def read(path: Path) -> export.Exported | None:
         for name in said["classes"]:
             _register(_object(name))
         return export.deserialize(bytearray(body))
-    except (OSError, ValueError, KeyError, TypeError, NamelessError):
+    except (OSError, ValueError, KeyError, TypeError, ImportError, NamelessError):
         return None
 
 
