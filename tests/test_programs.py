@@ -32,6 +32,8 @@ if sys.argv[-1] == "die":
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder for programs, used by this process and those it starts."""
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    # What is set here would else be set for the tests after this one.
+    monkeypatch.setenv("WLPLAN_TRACES", "")
     for name in ("MIN_COMPILE_TIME_SECS", "MIN_ENTRY_SIZE_BYTES"):
         monkeypatch.setenv(f"JAX_PERSISTENT_CACHE_{name}", "0")
     monkeypatch.setenv(programs.VARIABLE, str(tmp_path / "kept"))

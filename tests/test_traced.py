@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cones
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -256,3 +257,21 @@ def test_without_what_jax_writes_by_it_is_traced(
     monkeypatch.setattr(kept, "write", write)
     assert called(yields, Scaled(jnp.ones(2)))[0].mass.tolist() == [2.0, 2.0]
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_plan_that_is_played_by_it_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All programs that planning keeps, with the types that they are declared with."""
+    pile, world = cones.cone(), wlplan.world(cones.bowl_world)
+    monkeypatch.setattr(kept, "_KNOWN", (*kept._KNOWN, "cones"))
+    plain_one = wlplan.plan_loads(world, pile, loads=2, site=cones.SITE, planner="greedy")
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    for _ in range(2):
+        plan = wlplan.plan_loads(world, pile, loads=2, site=cones.SITE, planner="greedy")
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), plain_one, plan
+        )
+    names = {path.suffix for path in tmp_path.iterdir()}
+    assert names == {ENDING}

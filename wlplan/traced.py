@@ -152,8 +152,8 @@ def _program(call: _Call, folder: Path, leaves: Sequence[Any]) -> Callable[..., 
         # JAX has what comes of a kept trace committed to its device, and would compile all anew
         # that is called with it. On a CPU nothing is copied here. Other threads go on meanwhile,
         # as they would not while numpy waits.
-        done = jax.block_until_ready(compiled(*leaves))
-        return jax.device_put(jax.tree.map(np.asarray, done))
+        done, tree = jax.tree.flatten(jax.block_until_ready(compiled(*leaves)))
+        return tree.unflatten(jax.device_put([np.asarray(leaf) for leaf in done]))
 
     return free
 
