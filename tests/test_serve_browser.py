@@ -130,7 +130,7 @@ def test_a_scan_is_dropped_and_planned(
     assert plan["pile"]["keep_out"] == "keep-out.geojson"
 
     # The report, which may run its own script and reach nothing here.
-    with page.context.expect_page() as waited:
+    with page.context.expect_page(timeout=120_000) as waited:
         page.locator("#files a", has_text="report.html").click()
     report = waited.value
     opened.watch(report)
