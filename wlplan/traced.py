@@ -152,6 +152,7 @@ def _program(call: _Call, folder: Path, leaves: Sequence[Any]) -> Callable[..., 
         # JAX has what comes of a kept trace committed to its device, and would compile all anew
         # that is called with it. On a CPU nothing is copied here. Other threads go on meanwhile,
         # as they would not while numpy waits.
+        tree: Any
         done, tree = jax.tree.flatten(jax.block_until_ready(compiled(*leaves)))
         return tree.unflatten(jax.device_put([np.asarray(leaf) for leaf in done]))
 
