@@ -20,6 +20,7 @@ from jaxtyping import Array
 import wlplan
 from wlplan import traced as kept
 from wlplan.cli import programs
+from wlplan.errors import InputError
 from wlplan.planning.amounts import Empty, Loads, Tonnes, Trucks
 from wlplan.planning.job import make_job
 from wlplan.site.machine import WA320
@@ -256,6 +257,20 @@ def test_without_what_jax_writes_by_it_is_traced(
 
     monkeypatch.setattr(kept, "write", write)
     assert called(yields, Scaled(jnp.ones(2)))[0].mass.tolist() == [2.0, 2.0]
+    assert traces == ["yields"]
+    assert list(folder.iterdir()) == []
+
+
+def wrong(one: Scaled) -> Array:
+    """What goes wrong as it is traced."""
+    traces.append("wrong")
+    raise InputError("it makes no sense.")
+
+
+def test_what_goes_wrong_in_a_trace_is_said_once(folder: Path) -> None:
+    with pytest.raises(InputError, match="no sense"):
+        called(wrong, Scaled(jnp.ones(2)))
+    assert traces == ["wrong"]
     assert list(folder.iterdir()) == []
 
 

@@ -9,6 +9,7 @@ traced as ever.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import enum
 import functools
@@ -124,22 +125,18 @@ class _Call:
 def _program(call: _Call, folder: Path, leaves: Sequence[Any]) -> Callable[..., Any] | None:
     """The call as a function of its leaves, from its file or else traced and then kept.
 
-    None: it has no name, or JAX cannot write it.
+    None: it has no name. What cannot be written is for this process alone: it is not traced twice.
     """
-    kept = None
     try:
         path = folder / (call.name() + ENDING)
-        kept = read(path)
-        if kept is None:
-            kept = call.lowered(leaves)
-            write(path, kept)
-    except (NamelessError, ValueError, NotImplementedError, ImportError):
-        # The last: JAX writes by flatbuffers, which it does not install.
+    except NamelessError:
         return None
-    except OSError:
-        # It could not be written: then it is for this process alone.
-        if kept is None:
-            return None
+    kept = read(path)
+    if kept is None:
+        kept = call.lowered(leaves)
+        # No room, something static in the result, or no flatbuffers, which JAX does not install.
+        with contextlib.suppress(OSError, NamelessError, ImportError):
+            write(path, kept)
 
     def run(*leaves: Any) -> Any:
         return kept.call(*leaves)

@@ -24,7 +24,7 @@ from wlplan.planning.yard import packed_soil
 from wlplan.site.receiver import Receiver
 from wlplan.terrain.characteristics import characteristics
 from wlplan.terrain.heightmap import sample_local
-from wlplan.traced import traced
+from wlplan.traced import Traced, traced
 from wlplan.types import (
     Characteristics,
     LoadingPlan,
@@ -241,7 +241,7 @@ def played_at(world: Any, pile: Pile, one: LoadingPlan) -> Played:
     return _played(world, pile, one, report=True)
 
 
-_decided = traced()(decided)
+_decided = Traced(decided)
 
 
 def play_one(
