@@ -6,8 +6,10 @@ import math
 import os
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cones
 import jax
@@ -272,6 +274,28 @@ def test_what_goes_wrong_in_a_trace_is_said_once(folder: Path) -> None:
         called(wrong, Scaled(jnp.ones(2)))
     assert traces == ["wrong"]
     assert list(folder.iterdir()) == []
+
+
+def test_two_threads_may_come_with_the_same_class(monkeypatch: pytest.MonkeyPatch) -> None:
+    """JAX refuses a class that it knows already."""
+
+    class Pair(NamedTuple):
+        one: int
+
+    known = list[type]()
+
+    def slow(kind: type, **_: object) -> None:
+        was = kind in known
+        time.sleep(0.05)
+        if was or kind in known:
+            raise ValueError("Duplicate")
+        known.append(kind)
+
+    monkeypatch.setattr(kept.export, "register_namedtuple_serialization", slow)
+    monkeypatch.setattr(kept, "name_of", lambda kind: kind.__name__)
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(kept._register, [Pair] * 4))
+    assert known == [Pair]
 
 
 @pytest.mark.slow

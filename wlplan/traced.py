@@ -19,6 +19,7 @@ import importlib.resources
 import inspect
 import json
 import os
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -186,9 +187,18 @@ def read(path: Path) -> export.Exported | None:
         return None
 
 
-@functools.cache
+# Programs are traced in several threads, and JAX takes a class once.
+_registering = threading.Lock()
+
+
 def _register(kind: type) -> None:
     """Has JAX write and read results of a class of ours."""
+    with _registering:
+        _register_once(kind)
+
+
+@functools.cache
+def _register_once(kind: type) -> None:
     if issubclass(kind, tuple):
         export.register_namedtuple_serialization(kind, serialized_name=name_of(kind))
         return
