@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +24,8 @@ from laws import assert_volume_kept
 
 import wlplan
 from wlplan.planning.rollout import rollout
-from wlplan.terrain.automaton import settle, settle_dug, window_of
+from wlplan.site.soil import GRAVEL
+from wlplan.terrain.automaton import DEFAULT_SCHEDULE, settle, settle_dug, window_of
 from wlplan.terrain.automaton.windows import paste
 from wlplan.terrain.excavation import excavate
 from wlplan.terrain.heightmap import add_local_change, sample_local
@@ -168,6 +170,21 @@ def plainly_settled(pile: Pile) -> Pile:
     return settle(pile).pile
 
 
+@pytest.mark.slow
+@given(sorts)
+@settings(max_examples=examples(40))
+def test_settling_in_float32_is_settling_in_float64(sort: Sort) -> None:
+    """To what a slope between two cells may be too steep: rounding decides when that is enough."""
+    pile = pile_of(sort)
+    repose, tolerance = GRAVEL.repose_angle, DEFAULT_SCHEDULE.tolerance
+    bound = CELL * (math.tan(repose + tolerance) - math.tan(repose))
+    exact = in_float64(lambda pile: plainly_settled(pile).height, pile)[0]
+    height = plainly_settled(pile).height
+    np.testing.assert_allclose(height, exact, atol=bound)
+    # That is a few cells; the others differ by rounding.
+    assert np.median(abs(np.asarray(height, np.float64) - exact)) < 1e-6
+
+
 # --- excavation
 
 
@@ -205,6 +222,26 @@ def test_what_is_dug_has_left_the_pile(sort: Sort, place: str, seed: int, volume
     assert gone.min() >= 0.0
     assert (height - np.asarray(pile.floor)).min() >= -EPS * np.abs(before).max()
     assert not gone[~np.asarray(pile.valid)].any()
+
+
+@pytest.mark.slow
+@given(sorts, places, seeds, volumes)
+@settings(max_examples=examples(40))
+def test_what_is_dug_in_float32_is_what_is_dug_in_float64(
+    sort: Sort, place: str, seed: int, volume: float
+) -> None:
+    """To the rounding of where cells lie in the cut, there and back."""
+    pile, pose = pile_of(sort), pose_of(place, seed)
+    after = plainly_dug(pile, pose, jnp.float32(volume))
+    height, dug = in_float64(plainly_dug, pile, pose, jnp.float32(volume))
+    np.testing.assert_allclose(after[0], height, atol=2.0 * rounding_of_samples(pile, pose))
+    np.testing.assert_allclose(after[1], dug, rtol=1e-6, atol=1e-6)
+
+
+@jax.jit
+def plainly_dug(pile: Pile, pose: Pose, volume: jax.Array) -> Any:
+    after = excavate(pile, pose, volume, width=WIDTH)
+    return after.pile.height, after.volume
 
 
 # --- local maps
@@ -251,13 +288,18 @@ def rounding_of_samples(pile: Pile, pose: Pose) -> float:
 @given(sorts, places, seeds)
 def test_local_maps_of_float32_are_those_of_float64(sort: Sort, place: str, seed: int) -> None:
     pile, pose = pile_of(sort), pose_of(place, seed)
+    exact = in_float64(local, pile, pose)
+    np.testing.assert_allclose(local(pile, pose), exact[0], atol=rounding_of_samples(pile, pose))
+
+
+def in_float64(function: Callable[..., Any], *arguments: Any) -> list[np.ndarray]:
+    """Leaves of what a function makes of the same numbers in float64."""
     with jax.enable_x64(True):
-        exact_pile, exact_pose = jax.tree.map(
-            lambda leaf: leaf if leaf.dtype == bool else jnp.asarray(leaf, jnp.float64),
-            (pile, pose),
+        exact = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, jnp.float64) if leaf.dtype == jnp.float32 else leaf,
+            arguments,
         )
-        exact = numbers(local(exact_pile, exact_pose))[0]
-    np.testing.assert_allclose(local(pile, pose), exact, atol=rounding_of_samples(pile, pose))
+        return numbers(function(*exact))
 
 
 @jax.jit
@@ -291,6 +333,25 @@ def test_a_change_that_is_written_back_keeps_its_volume(
     assert abs((height - before).sum() * CELL**2 - wanted) <= CELL**2 * EPS * gross
     lowest = np.minimum(before, np.asarray(pile.floor))
     assert (height - lowest).min() >= -4.0 * EPS * np.abs(before).max() - 1e-9
+
+
+@pytest.mark.slow
+@given(sorts, places, seeds, seeds)
+@settings(max_examples=examples(40))
+def test_a_change_is_written_in_float32_as_in_float64(
+    sort: Sort, place: str, seed: int, other: int
+) -> None:
+    """To the rounding of where cells lie in the local map, there and back."""
+    pile, pose, change = pile_of(sort), pose_of(place, seed), change_of(other)
+    height, missing = plainly_written(pile, pose, change)
+    exact, exactly_missing = in_float64(plainly_written, pile, pose, change)
+    np.testing.assert_allclose(height, exact, atol=2.0 * rounding_of_samples(pile, pose))
+    np.testing.assert_allclose(missing, exactly_missing, atol=1e-6)
+
+
+@jax.jit
+def plainly_written(pile: Pile, pose: Pose, change: jax.Array) -> Any:
+    return add_local_change(pile.height, pile, pose, change, 1.0)
 
 
 # --- any arguments in a batch

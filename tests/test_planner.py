@@ -14,12 +14,12 @@ from laws import assert_gradient
 import wlplan
 from wlplan.actions import squash, unsquash
 from wlplan.errors import InputError
-from wlplan.planning.amounts import Loads
+from wlplan.planning.amounts import Loads, Trucks
 from wlplan.planning.job import judged, make_job, with_toe
 from wlplan.planning.loading import Loading
 from wlplan.planning.plan import plan_loads, play
-from wlplan.planning.planners import Gradient, Greedy, Nominal
-from wlplan.planning.planners.greedy import cost_of, plan_of
+from wlplan.planning.planners import Gradient, Greedy, Nominal, greedy
+from wlplan.planning.planners.greedy import cost_by_thorough_ways, cost_of, plan_of
 from wlplan.planning.playing import PlanResult, outcomes
 from wlplan.planning.poses import distance_to_toe, pose_at, toe_of
 from wlplan.planning.watch import Watch
@@ -239,6 +239,42 @@ def test_a_load_follows_on_the_pile_that_the_referee_leaves() -> None:
     )
     # The ways of greedy are good ones, those of a play the best.
     assert played.cost[0] <= cost_of(asked, made) <= 1.01 * played.cost[0]
+    np.testing.assert_allclose(cost_by_thorough_ways(asked, made, 2), played.cost[0], rtol=1e-6)
+
+
+def test_loads_that_fill_trucks_cost_what_a_play_of_them_says() -> None:
+    """Waits, misfits and what is missing included."""
+    job = with_toe(make_job(bowl_world, cone(), site=SITE, amount=Trucks(2, 4.0)), circle())
+    made = GREEDY.grow(job, [], 5, np.random.default_rng(0), Watch())
+    plan = jax.tree.map(lambda leaf: leaf[None], plan_of(job, made, 5))
+    assert len(set(np.asarray(plan.truck[0]).tolist())) >= 2
+    played = outcomes(job, plan)
+    np.testing.assert_allclose(cost_by_thorough_ways(job, made, 5), played.cost[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("slower", "count"), [(1.0, 2), (1.5, 8)])
+def test_the_referee_plays_no_more_than_it_has_to(
+    slower: float, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two, where it sees what was foreseen; all, where every load is worse than that."""
+
+    def referee(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+        after, performance = bowl_world(pile, pose, action)
+        return after, performance.replace(time=slower * performance.time + 10.0 * (slower - 1.0))
+
+    played: list[int] = []
+    play = greedy._scores_as_played
+
+    def counted(shared: Any, loads: Any) -> Any:
+        played.append(len(loads[0].position))
+        return play(shared, loads)
+
+    monkeypatch.setattr(greedy, "_scores_as_played", counted)
+    job = with_toe(make_job(bowl_world, cone(), site=SITE, amount=Loads(1)), circle())
+    watch = Watch()
+    asked = job.replace(referee=as_pytree(referee))
+    dataclasses.replace(GREEDY, refined=8).grow(asked, [], 1, np.random.default_rng(0), watch)
+    assert sum(played) == count
 
 
 def test_bad_requests_are_refused() -> None:

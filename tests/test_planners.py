@@ -30,7 +30,7 @@ from wlplan.planning.planners import (
     TreeSearch,
 )
 from wlplan.planning.planners.cross_entropy import _coloured
-from wlplan.planning.planners.greedy import cost_of, plan_of
+from wlplan.planning.planners.greedy import cost_by_thorough_ways, cost_of, plan_of
 from wlplan.planning.playing import PlanResult, outcomes
 from wlplan.planning.population import Near, Spread
 from wlplan.planning.proposals import Proposals
@@ -225,6 +225,7 @@ def test_what_is_made_is_kept_and_the_rest_is_made_again() -> None:
     for one in (made, again):
         played = outcomes(asked, jax.tree.map(lambda leaf: leaf[None], plan_of(asked, one, 2)))
         np.testing.assert_allclose(cost_of(asked, one), played.cost[0], rtol=1e-5)
+        np.testing.assert_allclose(cost_by_thorough_ways(asked, one, 2), played.cost[0], rtol=1e-6)
 
 
 def test_a_tree_sees_what_a_load_spoils(plans: dict[str, PlanResult]) -> None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import cones
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -291,7 +292,7 @@ def test_two_threads_may_come_with_the_same_class(monkeypatch: pytest.MonkeyPatc
             raise ValueError("Duplicate")
         known.append(kind)
 
-    monkeypatch.setattr(kept.export, "register_namedtuple_serialization", slow)
+    monkeypatch.setattr(jax.export, "register_namedtuple_serialization", slow)
     monkeypatch.setattr(kept, "name_of", lambda kind: kind.__name__)
     with ThreadPoolExecutor(4) as threads:
         list(threads.map(kept._register, [Pair] * 4))

@@ -27,6 +27,9 @@ from wlplan.constants import PERCENT_90 as PERCENT_90
 from wlplan.models.performance import PerformanceModel
 from wlplan.types import Characteristics, LocalHeightmap, Performance
 
+# Members that have a spread among them.
+_FEWEST = 2
+
 
 @no_type_check
 class Ensemble(struct.PyTreeNode, eq=False):
@@ -43,6 +46,11 @@ class Ensemble(struct.PyTreeNode, eq=False):
     def size(self) -> int:
         """Number of members."""
         return len(jax.tree.leaves(self.members.params)[0])
+
+    def roughly(self) -> Ensemble:
+        """The first members alone: as many as a spread among them takes."""
+        params = jax.tree.map(lambda leaf: leaf[:_FEWEST], self.members.params)
+        return self.replace(members=self.members.replace(params=params))
 
     @property
     def view_variable(self) -> str:

@@ -23,6 +23,7 @@ from wlplan.planning.stepping import next_load, score_of, score_of_next
 from wlplan.planning.watch import Watch
 from wlplan.traced import traced
 from wlplan.types import Pile, Pose
+from wlplan.worlds.capabilities import roughly
 from wlplan.xla import floats
 
 
@@ -55,7 +56,8 @@ class Ranked(NamedTuple):
 class LoadSearch:
     """How next loads are searched for; what planners have in common that go load by load.
 
-    In a world without a derivative nothing is refined.
+    What is tried is foreseen roughly, if the world can, and what is refined fully. In a world
+    without a derivative nothing is refined.
     """
 
     # Poses a metre of contour, heading offsets before squashing, and actions that are tried.
@@ -66,8 +68,8 @@ class LoadSearch:
     neighbours: int = 2
     # Candidates that are refined, each at a pose of its own, and steps and rate of Adam.
     refined: int = 8
-    refine_steps: int = 30
-    refine_rate: float = 0.08
+    refine_steps: int = 20
+    refine_rate: float = 0.1
     # Candidates that are evaluated at once: bounds the memory.
     batch: int = 256
 
@@ -217,7 +219,9 @@ class LoadSearch:
         count = len(poses)
         rows = _portions(count, max(1, self.batch // len(actions)))
         parts = jax.tree.map(lambda leaf: leaf[rows], (poses, cusps))
-        found = _costs_of_portions((job, standing, actions), parts)
+        # What is refined afterwards need not be known well before.
+        look = _rough_costs if can_refine(job, self.refine_steps) else _costs_of_portions
+        found = look((job, standing, actions), parts)
         costs, masses = (np.asarray(leaf).reshape(-1, len(actions))[:count] for leaf in found)
         return np.nan_to_num(costs, nan=np.inf, posinf=np.inf), masses
 
@@ -256,7 +260,16 @@ def costs_at_poses(
     return jax.vmap(at_pose)(*at)
 
 
+def rough_costs_at_poses(
+    shared: tuple[Job, Standing, Float[Array, "a 4"]], at: _At
+) -> tuple[Float[Array, "p a"], Float[Array, "p a"]]:
+    """The same as the world foresees it roughly, if it can."""
+    job, standing, actions = shared
+    return costs_at_poses((job.replace(world=roughly(job.world)), standing, actions), at)
+
+
 _costs_of_portions = ParallelMap(costs_at_poses)
+_rough_costs = ParallelMap(rough_costs_at_poses)
 
 
 def _portions(count: int, size: int) -> Int[np.ndarray, "portions size"]:

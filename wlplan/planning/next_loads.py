@@ -19,7 +19,12 @@ from wlplan.actions import spread_actions
 from wlplan.planning.amounts import Outlook
 from wlplan.planning.driving import room_of
 from wlplan.planning.job import Decisions, Job, Standing, beginning, contour_length, decided
-from wlplan.planning.load_search import LoadSearch, costs_at_poses, refined_loads
+from wlplan.planning.load_search import (
+    LoadSearch,
+    costs_at_poses,
+    refined_loads,
+    rough_costs_at_poses,
+)
 from wlplan.planning.loading import Transport
 from wlplan.planning.poses import pose_at
 from wlplan.planning.search import Cusps
@@ -125,7 +130,8 @@ class _Portions(NamedTuple):
 
         of_pose = np.arange(len(poses)) // (self.search.neighbours * len(self.search.offsets))
         cusps = jax.tree.map(lambda leaf: leaf[of_pose], jax.vmap(way)(searched))
-        costs, _ = costs_at_poses((job, self.standing, self.actions), (poses, cusps))
+        look = rough_costs_at_poses if self.search.refine_steps else costs_at_poses
+        costs, _ = look((job, self.standing, self.actions), (poses, cusps))
         return _Tried(poses, cusps, jnp.nan_to_num(costs, nan=jnp.inf, posinf=jnp.inf))
 
     def empty(self) -> _Tried:

@@ -296,6 +296,41 @@ def play_by_load(job: Job, candidate: Decisions | LoadingPlan) -> PlanResult:
     return assemble(job, loadings, standing, known)
 
 
+def cost_as_played(
+    job: Job,
+    truck: Int[Array | np.ndarray, " n"] | None,
+    loads: Sequence[tuple[Standing, LoadingPlan, Performance]],
+    last: Standing,
+) -> float:
+    """What `play_by_load` would say that a plan costs whose loads were played already.
+
+    Args:
+        job: The job in the world that played.
+        truck: That each row of the plan goes to; None: as the amount has it.
+        loads: Of each load that is made what stood before it, where it was dug, and what it
+            yielded.
+        last: After them.
+    """
+    count, leaves = len(loads), None
+    if truck is not None:
+        leaves = np.asarray(leaves_after(jnp.asarray(truck)))[:count]
+    before, dug, performance = jax.tree.map(
+        lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *loads
+    )
+    dug = dug.replace(truck=None if truck is None else np.asarray(truck)[:count])
+    costs = _costs_as_played(counting(job), (before, dug, performance, leaves))
+    return float(np.asarray(costs).sum() + job.amount.rest(last.done))
+
+
+def _cost_as_played(counted: Job, load: Any) -> Float[Array, ""]:
+    before, dug, performance, leaves = load
+    cost: Array = assess(counted, before, dug, performance, leaves=leaves)[0].cost
+    return cost
+
+
+_costs_as_played = ParallelMap(_cost_as_played, on_core=_cost_as_played)
+
+
 def leaves_after(truck: Int[Array, " n"]) -> Bool[Array, " n"]:
     """Whether the truck of each load leaves after it."""
     following = jnp.append(truck[1:], jnp.full_like(truck[:1], -1))

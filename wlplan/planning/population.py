@@ -101,11 +101,15 @@ class Pool:
         self._watch.spend(loading=plans.position.size, way=plans.position.size)
         costs = np.asarray(outcomes(self._job, plans).cost, np.float64)
         costs = np.nan_to_num(costs, nan=np.inf, posinf=np.inf)
-        order = np.argsort(costs, kind="stable")[: self._size]
-        found = [(float(costs[k]), jax.tree.map(lambda leaf, k=k: leaf[k], plans)) for k in order]
-        self._best = sorted([*self._best, *found], key=lambda pair: pair[0])[: self._size]
-        self._watch.keep(self._best[0][1], self._best[0][0])
+        for k in np.argsort(costs, kind="stable")[: self._size]:
+            self.add(jax.tree.map(lambda leaf, k=k: leaf[k], plans), float(costs[k]))
         return costs
+
+    def add(self, plan: Decisions, cost: float) -> None:
+        """Remembers a plan, leaves [N], whose cost is known."""
+        best = sorted([*self._best, (cost, plan)], key=lambda pair: pair[0])
+        self._best = best[: self._size]
+        self._watch.keep(self._best[0][1], self._best[0][0])
 
     def cheapest(self) -> Decisions:
         """The cheapest plans, the very best first, leaves [K, N].

@@ -18,13 +18,13 @@ from wlplan.types import LoadingPlan
 EFFORTS = {
     "loading": 1.0,
     "gradient": 4.0,
-    "look": 1.0 / 60.0,
+    "look": 1.0 / 150.0,
     "look_gradient": 0.25,
     "way": 0.7,
     "quick_way": 0.3,
 }
 """What evaluations count, in loadings whose pile is predicted too: such a loading; the same and its
-gradient; one whose pile is not, at a pose where others are looked at as well; such a one alone and
+gradient; one whose pile is not, foreseen roughly, at a pose where others are too; such a one alone and
 its gradient; the search of a way, and that of one that need not be the best. By the time they take,
 which `python -m experiments.efforts` measures."""
 

@@ -11,6 +11,7 @@ more, where there is more to say:
   that the loading stalls.
 * `faces_seen`: the least and the largest characteristics of the faces that it was trained on.
 * `foresee(pile, pose, action)`: the performance alone, where that takes less than the pile after.
+* `roughly()`: a world that foresees about the same in less time, to find what is worth a look.
 * `solve(pile, pose, action)`: as by calling it, with a `SolveReport` besides.
 * `with_derivatives()`: the same world in the form that has derivatives.
 * `play_load(pile, pose, action, note)`: plays one loading outside of any trace and returns pile,
@@ -131,6 +132,11 @@ def foresee(world: World, pile: Pile, pose: Pose, action: Action) -> Performance
         world(pile, pose, action)[1] if alone is None else alone(pile, pose, action)
     )
     return performance
+
+
+def roughly(world: World) -> World:
+    """The world in the form that is quick and rough, where it has one."""
+    return getattr(world, "roughly", lambda: world)()
 
 
 def can(world: Any, name: str) -> bool:

@@ -79,6 +79,11 @@ class LearnedWorld(struct.PyTreeNode, eq=False):
         performance: Performance = _foresee(self, pile, pose, action)
         return performance
 
+    def roughly(self) -> LearnedWorld:
+        """The same with a part of the ensemble, if ψ is one."""
+        performance = self.performance
+        return self.replace(performance=getattr(performance, "roughly", lambda: performance)())
+
     @property
     def faces_seen(self) -> tuple[Characteristics, Characteristics] | None:
         """Least and largest characteristics that ψ was trained on; None: it does not say."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import numpy as np
@@ -14,14 +14,20 @@ from jaxtyping import Array, Float
 from wlplan.parallel import ParallelMap
 from wlplan.planning.amounts import Loads, Outlook
 from wlplan.planning.job import Decisions, Job, Standing, beginning, judged, padded, stacked
-from wlplan.planning.load_search import LoadSearch, Memory, Tried
-from wlplan.planning.playing import counting, play_one
+from wlplan.planning.load_search import LoadSearch, Memory, Ranked, Tried
+from wlplan.planning.playing import cost_as_played, counting, play_one
 from wlplan.planning.proposals import NothingWorthIt, Progress, Proposals
 from wlplan.planning.search import Cusps
 from wlplan.planning.stepping import made, score_of_played
 from wlplan.planning.watch import Watch, watching
 from wlplan.traced import Traced
-from wlplan.types import Pile
+from wlplan.types import LoadingPlan, Performance, Pile
+
+# So many loads are played in the referee at once, and then the next: mostly the first suffice.
+_AT_ONCE = 2
+# One is as good there as it was foreseen if its score is off by no more than this [1]. Where
+# nothing goes wrong, models err by so much.
+_AS_FORESEEN = 0.01
 
 
 class Chosen(NamedTuple):
@@ -29,14 +35,24 @@ class Chosen(NamedTuple):
 
     decision: Decisions
     score: float  # as of `score_of_next`, to which later loads may not add
-    # The pile after it and its mass [tonne], by the referee if there is one; None: not played.
-    played: tuple[Pile, Float[Array, ""]] | None = None
+    played: LoadPlayed | None = None  # by the referee; None: not played
+
+
+class LoadPlayed(NamedTuple):
+    """What became of a load."""
+
+    dug: LoadingPlan  # where, and by which action
+    pile: Pile  # after it
+    performance: Performance
 
 
 class Grown(NamedTuple):
     """A load of a plan that grows."""
 
     decision: Decisions  # with its truck
+    dug: LoadingPlan
+    performance: Performance
+    before: Standing
     standing: Standing  # after it
     memory: Memory  # for the next
     cost: float  # of it, without the wait for a truck
@@ -49,9 +65,9 @@ class Greedy(LoadSearch):
     What a loading leaves to do is judged by what loads are like now: buckets to fill the truck
     with, or tonnes. In a world without a derivative nothing is refined.
 
-    Where there is a referee it plays the best few, and the one that is cheapest there is made, on
-    the pile as the referee leaves it: what the planning world does not see, such as a stall, is
-    avoided load by load.
+    Where there is a referee it plays the best, two at a time, until one is as good there as it was
+    foreseen, or all are played; the cheapest is made, on the pile as the referee leaves it. So what
+    the planning world does not see, such as a stall, is avoided load by load.
     """
 
     stage: ClassVar[str] = "greedy"  # as progress has it
@@ -106,13 +122,17 @@ class Greedy(LoadSearch):
             decision, score, played = self.choose(job, standing, tried, outlook, left, watch)
             if played is None:
                 watch.spend(loading=1)
-                _, one = play_one(judged(job), standing, decision)
-                played = one.pile, one.performance.mass
-            after, truck, cost = _made(job.amount, standing, played, outlook, score)
+                dug, one = play_one(judged(job), standing, decision)
+                played = LoadPlayed(dug, one.pile, one.performance)
+            yields = played.pile, played.performance.mass
+            after, truck, cost = _made(job.amount, standing, yields, outlook, score)
             if not job.amount.is_worth(float(after.done.mass - standing.done.mass)):
                 break
+            decision, dug = decision.replace(truck=truck), played.dug.replace(truck=truck)
+            made.append(
+                Grown(decision, dug, played.performance, standing, after, memory, float(cost))
+            )
             standing = after
-            made.append(Grown(decision.replace(truck=truck), standing, memory, float(cost)))
             if says:
                 watch.keep(plan_of(job, made, loads), -math.inf)
                 watch(self.stage, len(made), loads, cost_of(job, made))
@@ -141,17 +161,10 @@ class Greedy(LoadSearch):
         """
         del left
         found = self.best(job.replace(referee=None), standing, tried, outlook, watch)
-        scores, played = found.scores, None
         if job.referee is not None:
-            watch.spend(loading=len(scores))
-            loads = found.decisions, found.cusps
-            scores, *played = _scores_as_played((judged(job), standing, outlook), loads)
-            scores = np.nan_to_num(np.asarray(scores), nan=np.inf)
-        best = int(np.argmin(scores))
-        decision, after = jax.tree.map(
-            lambda leaf: np.asarray(leaf)[best], (found.decisions, played)
-        )
-        return Chosen(decision, float(scores[best]), None if after is None else tuple(after))
+            return _best_in_referee(job, standing, found, outlook, watch)
+        best = int(np.argmin(found.scores))
+        return Chosen(_row(found.decisions, best), float(found.scores[best]))
 
 
 def plan_of(job: Job, made: Sequence[Grown], loads: int) -> Decisions:
@@ -163,21 +176,56 @@ def plan_of(job: Job, made: Sequence[Grown], loads: int) -> Decisions:
     return padded(chosen, loads)
 
 
+def cost_by_thorough_ways(job: Job, made: Sequence[Grown], loads: int) -> float:
+    """What the plan costs as it was played, the ways searched for as thoroughly as in a result."""
+    truck = plan_of(job, made, loads).truck
+    rows = [(one.before, one.dug, one.performance) for one in made]
+    return cost_as_played(judged(job), truck, rows, made[-1].standing)
+
+
 def cost_of(job: Job, made: Sequence[Grown]) -> float:
     """What loads cost, and what they leave undone; without the waits for trucks."""
     return sum(one.cost for one in made) + float(job.amount.rest(made[-1].standing.done))
 
 
+def _best_in_referee(
+    job: Job, standing: Standing, found: Ranked, outlook: Outlook, watch: Watch
+) -> Chosen:
+    """The cheapest in the referee of those that have to be played there, see `Greedy`."""
+    shared, loads = (judged(job), standing, outlook), (found.decisions, found.cusps)
+    order = np.argsort(found.scores)
+    chosen: Chosen | None = None
+    for first in range(0, len(order), _AT_ONCE):
+        rows, following = np.split(order[first:], [_AT_ONCE])
+        watch.spend(loading=len(rows))
+        scores, *played = _scores_as_played(shared, _row(loads, rows))
+        scores = np.nan_to_num(np.asarray(scores), nan=np.inf)
+        best = int(np.argmin(scores))
+        if chosen is None or scores[best] < chosen.score:
+            decision, one = _row(found.decisions, rows[best]), LoadPlayed(*_row(played, best))
+            chosen = Chosen(decision, float(scores[best]), one)
+        if len(following):
+            foreseen = float(found.scores[following[0]])
+            if chosen.score <= foreseen + _AS_FORESEEN * abs(foreseen):
+                break
+    assert chosen is not None
+    return chosen
+
+
+def _row(tree: Any, row: Any) -> Any:
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[row], tree)
+
+
 def _score_as_played(
     shared: tuple[Job, Standing, Outlook], load: tuple[Decisions, Cusps]
-) -> tuple[Float[Array, ""], Pile, Float[Array, ""]]:
-    """Score of a load by what the world of the job makes of it, the pile after it, its mass."""
+) -> tuple[Float[Array, ""], LoadingPlan, Pile, Performance]:
+    """Score of a load by what the world of the job makes of it, and that, as `LoadPlayed`."""
     job, standing, outlook = shared
     decision, cusps = load
     one, played = play_one(job, standing, decision)
     made = one, played.performance
     score = _score_of_played(counting(job), standing, made, outlook, cusps)
-    return score, played.pile, played.performance.mass
+    return score, one, played.pile, played.performance
 
 
 _score_of_played = Traced(score_of_played)

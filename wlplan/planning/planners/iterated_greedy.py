@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import ClassVar
 
-import jax
 import numpy as np
 
-from wlplan.planning.job import Job, judged
-from wlplan.planning.planners.greedy import Greedy, Grown, plan_of
+from wlplan.planning.job import Job
+from wlplan.planning.planners.greedy import Greedy, Grown, cost_by_thorough_ways, plan_of
 from wlplan.planning.population import Pool
 from wlplan.planning.proposals import Progress, Proposals
 from wlplan.planning.watch import watching
@@ -30,13 +30,13 @@ class IteratedGreedy:
     plays_in_referee: ClassVar[bool] = True
 
     # How often loads are made again.
-    rounds: int = 6
+    rounds: int = 2
     # Greedy, and how many of its plans are made from nothing before that.
     greedy: Greedy = _GREEDY
     starts: int = 2
     # Of how many plans, the best so far, one is drawn whose loads are made again.
     parents: int = 3
-    # How many plans are handed on.
+    # How many plans are handed on; the best alone if the referee has played them already.
     candidates: int = 8
 
     @classmethod
@@ -53,7 +53,8 @@ class IteratedGreedy:
         """
         watch = watching(progress)
         random = np.random.default_rng(seed)
-        pool = Pool(judged(job), watch, self.candidates)
+        size = self.candidates if job.referee is None else 1
+        pool = Pool(job, watch, size)
         best: list[tuple[float, list[Grown]]] = []
         total = self.starts + self.rounds
         for number in range(total):
@@ -63,8 +64,10 @@ class IteratedGreedy:
                 kept = parent[: random.integers(len(parent))]
             made = self.greedy.grow(job, kept, loads, random, watch, says=not best)
             # What greedy makes of the ways is too rough to choose by.
-            plan = jax.tree.map(lambda leaf: leaf[None], plan_of(job, made, loads))
-            cost = float(pool.play(plan)[0])
+            watch.spend(way=len(made))
+            cost = cost_by_thorough_ways(job, made, loads)
+            cost = cost if math.isfinite(cost) else math.inf
+            pool.add(plan_of(job, made, loads), cost)
             best = sorted([*best, (cost, made)], key=lambda pair: pair[0])[: self.parents]
             watch("iterated greedy", number + 1, total, pool.least)
         return Proposals(pool.cheapest())
