@@ -22,6 +22,7 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 import wlplan
+from experiments._common.benchmark_tables import tables
 from experiments._common.budgets import OverBudget, Within
 from experiments._common.comparison import (
     IN_REFEREE,
@@ -450,7 +451,9 @@ def _make(options: argparse.Namespace, folder: Path) -> None:
         for one in best_plans(rows, [] if known is None else json.loads(known.read_text()))
     )
     write_text_atomic(folder / BEST, f"[{lines}]\n")
-    write_result("planner_benchmark", options.preset, run(options.preset, rows), folder)
+    result = run(options.preset, rows)
+    write_result("planner_benchmark", options.preset, result, folder)
+    write_text_atomic(folder / "planner_benchmark.md", tables(result))
 
 
 # Few trials each: whether all goes through, and not what it comes to.

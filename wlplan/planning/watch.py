@@ -24,9 +24,9 @@ EFFORTS = {
     "quick_way": 0.3,
 }
 """What evaluations count, in loadings whose pile is predicted too: such a loading; the same and its
-gradient; one whose pile is not, foreseen roughly, at a pose where others are too; such a one alone and
-its gradient; the search of a way, and that of one that need not be the best. By the time they take,
-which `python -m experiments.efforts` measures."""
+gradient; one whose pile is not, roughly foreseen at a pose where others are looked at as well; such
+a one alone and its gradient; the search of a way, and that of one that need not be the best. By the
+time they take, which `python -m experiments.efforts` measures."""
 
 
 class BudgetSpent(Exception):  # noqa: N818

@@ -1,0 +1,113 @@
+"""The result of the benchmark of planners as tables that can be read."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from experiments._common.comparison import IN_REFEREE
+from experiments._common.instances import JOBS, PILES, SITES, SMOKE_JOB
+
+_NONE = "–"
+_MEASURES = ("cost", "seconds_a_tonne", "work_a_tonne")
+
+
+def tables(result: dict[str, Any]) -> str:
+    """All tables of a result, in Markdown.
+
+    Args:
+        result: As `planner_benchmark.run` returns it.
+    """
+    rows = result["rows"]
+    parts = [
+        "# Benchmark of planners",
+        f"{result['runs']:,} of {result['runs_of_the_preset']:,} runs; means over the seeds. "
+        "A budget is in times what greedy spends. A dash: not run.",
+    ]
+    for job in (SMOKE_JOB, *JOBS):
+        of_job = [row for row in rows if row["job"] == job]
+        if not of_job:
+            continue
+        if "loads" in job:
+            parts += [f"## {job}: cost foreseen / in the simulator", _by_pile(of_job, _costs)]
+        else:
+            parts += [f"## {job}: seconds a tonne in the simulator", _by_pile(of_job, _a_tonne)]
+            if job == "empty":
+                parts += ["Loads, minutes, stalls, tonnes short:", _by_pile(of_job, _emptied)]
+    parts += [
+        "## Looking ahead",
+        "The best planner that looks ahead beside greedy that has as much: less in the simulator "
+        "[%], mean over the piles and its interval of 95 %.",
+        _gains(result["looking_ahead"], ("looks ahead", "beside"), ("planner", "base")),
+        "## Step by step",
+        "Beside greedy with the fixed truck, on piles that have all steps: less in the simulator "
+        "[%].",
+        _gains(result["steps"], ("planner",), ("planner",)),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    rows = [head, ["---"] * len(head), *lines]
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _by_pile(rows: Sequence[dict[str, Any]], cell: Any) -> str:
+    """One line a site, planner and budget, one column a pile, and the time of the search."""
+    piles = [pile for pile in PILES if any(row["pile"] == pile for row in rows)]
+    lines = []
+    for site in SITES:
+        here = [row for row in rows if row["site"] == site]
+        for planner, budget in sorted({(row["planner"], row["budget"]) for row in here}):
+            own = [r for r in here if (r["planner"], r["budget"]) == (planner, budget)]
+            cells = [cell([row for row in own if row["pile"] == pile]) for pile in piles]
+            search = statistics.median(float(row["seconds"]) for row in own)
+            lines.append([site, planner, str(budget), *cells, f"{search:.0f}"])
+    return _table(["truck", "planner", "budget", *piles, "search [s]"], lines)
+
+
+def _mean(rows: Sequence[dict[str, Any]], value: Any) -> float:
+    return statistics.fmean(float(value(row)) for row in rows)
+
+
+def _costs(rows: Sequence[dict[str, Any]]) -> str:
+    if not rows:
+        return _NONE
+    played = f"{_mean(rows, lambda row: row['simulator']['cost']):.2f}"
+    # What is planned in the simulator is foreseen by it.
+    if rows[0]["planner"].endswith(IN_REFEREE):
+        return played
+    return f"{_mean(rows, lambda row: row['predicted']):.2f} / {played}"
+
+
+def _a_tonne(rows: Sequence[dict[str, Any]]) -> str:
+    if not rows:
+        return _NONE
+    return f"{_mean(rows, lambda row: row['simulator']['time'] / row['simulator']['mass']):.2f}"
+
+
+def _emptied(rows: Sequence[dict[str, Any]]) -> str:
+    if not rows:
+        return _NONE
+    loads, time, stalls, missing = (
+        _mean(rows, lambda row, name=name: row["simulator"][name])
+        for name in ("loads", "time", "stalls", "missing")
+    )
+    return f"{loads:.0f}, {time / 60.0:.1f}, {stalls:.0f}, {missing:.1f}"
+
+
+def _gains(rows: Sequence[dict[str, Any]], heads: Sequence[str], names: Sequence[str]) -> str:
+    lines = []
+    for row in rows:
+        measures = [_interval(row[measure]) for measure in _MEASURES]
+        planners = [str(row[name]) for name in names]
+        place = [row["job"], row["site"], *planners, str(row["budget"])]
+        lines.append([*place, str(row["cost"]["piles"]), *measures])
+    head = ["job", "truck", *heads, "budget", "piles", "cost", "time a tonne", "work a tonne"]
+    return _table(head, lines)
+
+
+def _interval(of: dict[str, Any]) -> str:
+    half = "" if of["half"] is None else f" ± {of['half']:.1f}"
+    return f"{of['mean']:.1f}{half}".replace("-", "−")
