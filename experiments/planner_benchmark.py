@@ -351,6 +351,7 @@ def run(preset: str, rows: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
     return {
         "runs": len(rows),
         "runs_of_the_preset": total,
+        "runs_with_other_settings": sum(not _of_today(row) for row in rows),
         "without_a_plan": sorted(
             {f"{row['planner']} at {row['budget']}" for row in rows if row["plan"] is None}
         ),
@@ -359,6 +360,31 @@ def run(preset: str, rows: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
         "planners": by_planner(compared),
         "rows": [{k: v for k, v in row.items() if k != "plan"} for row in compared],
     }
+
+
+def unpack(result: Path, folder: Path) -> None:
+    """Lays the rows of a committed result where rows are kept, so that none is made twice.
+
+    Their plans are not kept, but for the best, see `BEST`.
+
+    Args:
+        result: JSON that `run` came to; nothing is done if it is not there.
+        folder: Of the rows; what is there is left as it is.
+    """
+    if not result.exists():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    for row in json.loads(result.read_text())["rows"]:
+        instance = Instance(row["pile"], row["job"], row["site"])
+        path = folder / f"{Run(instance, row['planner'], row['budget'], row['seed']).name}.json"
+        if not path.exists():
+            write_text_atomic(path, json.dumps({**row, "plan": {}}) + "\n")
+
+
+def _of_today(row: dict[str, Any]) -> bool:
+    """Whether a row was made with the settings that its planner has today."""
+    planner = PLANNERS.get(row["planner"])
+    return planner is None or row["made_with"]["planner"] == repr(planner(row["budget"]))
 
 
 def draw(folder: Path) -> None:
@@ -432,6 +458,8 @@ def _make(options: argparse.Namespace, folder: Path) -> None:
     """Makes the runs that are asked for, and joins all that are there."""
     made = RowFiles(options.rows or (folder / ROWS.name if options.preset == "smoke" else ROWS))
     say(f"planner_benchmark: runs in {made.folder}; the result goes to {folder}")
+    if options.preset != "smoke":
+        unpack(RESULTS / "planner_benchmark.json", made.folder)
     planners = PLANNERS | {name: _always(load_object(name)) for name in options.planner}
     chosen = tuple(SMOKE if options.preset == "smoke" else planners)
     if not options.join:

@@ -13,6 +13,7 @@ from cones import SITE, circle, cone, spoilt_world
 
 from experiments import planner_benchmark as benchmark
 from experiments._common import comparison
+from experiments._common.benchmark_tables import tables
 from experiments._common.budgets import OverBudget, Within
 from experiments._common.instances import Instance
 from experiments._common.row_files import RowFiles, part_of
@@ -188,3 +189,41 @@ def test_walls_stand_around_the_soil_and_leave_the_west_open(name: str) -> None:
         assert not walls[:i, j].any()
     assert not instance.is_free
     assert dataclasses.replace(instance, site="walls, free truck").is_free
+
+
+def test_the_tables_have_means_over_seeds_and_a_dash_for_what_was_not_run() -> None:
+    played = {"stalls": 0, "missing": 0.0, "misfit": 0.0, "touching": 0.0}
+    rows = [
+        row("cone", "greedy", 1, 0, 40.0, seconds=3.0),
+        row("cone", "greedy", 1, 1, 44.0, seconds=5.0),
+        row("ridge", "greedy", 1, 0, 50.0, seconds=4.0),
+        row("cone", "iterated greedy, in the simulator", 10, 0, 39.0, seconds=30.0),
+    ]
+    for one in rows:
+        one["spent"] = 100.0
+        one["simulator"] |= played
+        one["made_with"] = {"planner": repr(Greedy())}
+    result = benchmark.run("full", rows)
+    lines = tables(result).splitlines()
+    assert "| walls | greedy | 1 | 42.00 / 42.00 | 50.00 / 50.00 | 4 |" in lines
+    assert "| walls | iterated greedy, in the simulator | 10 | 39.00 | – | 30 |" in lines
+    assert not any("nan" in line for line in lines)
+    # Greedy today; the other one never had such settings.
+    assert result["runs_with_other_settings"] == 1
+
+
+def test_what_was_committed_is_not_made_again(tmp_path: Path) -> None:
+    (run,) = [one for one in benchmark.runs("smoke", ("greedy",))]
+    of = {**dataclasses.asdict(run.instance), "planner": "greedy", "budget": 1, "seed": 0}
+    rows = [{**of, "predicted": 1.0, "made_with": benchmark.made_with(run, GREEDY)}]
+    result, folder = tmp_path / "result.json", tmp_path / "rows"
+    result.write_text(json.dumps({"rows": rows}))
+    benchmark.unpack(result, folder)
+    found = RowFiles(folder).read(run.name, benchmark.made_with(run, GREEDY))
+    assert found == {**rows[0], "plan": {}}
+    # What was made since stays.
+    (folder / f"{run.name}.json").write_text("{}")
+    benchmark.unpack(result, folder)
+    assert RowFiles(folder).all() == [{}]
+    benchmark.unpack(tmp_path / "none.json", tmp_path / "none")
+    assert not (tmp_path / "none").exists()

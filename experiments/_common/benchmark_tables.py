@@ -19,10 +19,11 @@ def tables(result: dict[str, Any]) -> str:
     Args:
         result: As `planner_benchmark.run` returns it.
     """
-    rows = result["rows"]
+    rows, other = result["rows"], result["runs_with_other_settings"]
     parts = [
         "# Benchmark of planners",
-        f"{result['runs']:,} of {result['runs_of_the_preset']:,} runs; means over the seeds. "
+        f"{result['runs']:,} of {result['runs_of_the_preset']:,} runs, "
+        f"{other} of them with settings that their planners had before; means over the seeds. "
         "A budget is in times what greedy spends. A dash: not run.",
     ]
     for job in (SMOKE_JOB, *JOBS):

@@ -190,7 +190,8 @@ def best_plans(
     """
     best: dict[tuple[str, ...], dict[str, Any]] = {}
     for row in (*before, *rows):
-        if row["plan"] is None:
+        # None: there was not enough for one. Of rows that were committed it is not kept.
+        if not row["plan"]:
             continue
         place = row["pile"], row["job"], row["site"]
         if place not in best or row["simulator"]["cost"] < best[place]["simulator"]["cost"]:
