@@ -358,7 +358,10 @@ def run(preset: str, rows: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
         "steps": steps(compared, STEPS),
         "looking_ahead": looking_ahead(compared),
         "planners": by_planner(compared),
-        "rows": [{k: v for k, v in row.items() if k != "plan"} for row in compared],
+        "rows": [
+            {k: v for k, v in row.items() if k != "plan"} | {"of_today": _of_today(row)}
+            for row in compared
+        ],
     }
 
 

@@ -23,7 +23,7 @@ def tables(result: dict[str, Any]) -> str:
     parts = [
         "# Benchmark of planners",
         f"{result['runs']:,} of {result['runs_of_the_preset']:,} runs, "
-        f"{other} of them with settings that their planners had before; means over the seeds. "
+        f"{other} of them with settings that their planners had before (*); means over the seeds. "
         "A budget is in times what greedy spends. A dash: not run.",
     ]
     for job in (SMOKE_JOB, *JOBS):
@@ -40,11 +40,11 @@ def tables(result: dict[str, Any]) -> str:
         "## Looking ahead",
         "The best planner that looks ahead beside greedy that has as much: less in the simulator "
         "[%], mean over the piles and its interval of 95 %.",
-        _gains(result["looking_ahead"], ("looks ahead", "beside"), ("planner", "base")),
+        _gains(result["looking_ahead"], rows, ("looks ahead", "beside"), ("planner", "base")),
         "## Step by step",
         "Beside greedy with the fixed truck, on piles that have all steps: less in the simulator "
         "[%].",
-        _gains(result["steps"], ("planner",), ("planner",)),
+        _gains(result["steps"], rows, ("planner",), ("planner",)),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -64,8 +64,13 @@ def _by_pile(rows: Sequence[dict[str, Any]], cell: Any) -> str:
             own = [r for r in here if (r["planner"], r["budget"]) == (planner, budget)]
             cells = [cell([row for row in own if row["pile"] == pile]) for pile in piles]
             search = statistics.median(float(row["seconds"]) for row in own)
-            lines.append([site, planner, str(budget), *cells, f"{search:.0f}"])
+            name = planner + _mark(own)
+            lines.append([site, name, str(budget), *cells, f"{search:.0f}"])
     return _table(["truck", "planner", "budget", *piles, "search [s]"], lines)
+
+
+def _mark(rows: Sequence[dict[str, Any]]) -> str:
+    return "" if all(row["of_today"] for row in rows) else " *"
 
 
 def _mean(rows: Sequence[dict[str, Any]], value: Any) -> float:
@@ -98,15 +103,28 @@ def _emptied(rows: Sequence[dict[str, Any]]) -> str:
     return f"{loads:.0f}, {time / 60.0:.1f}, {stalls:.0f}, {missing:.1f}"
 
 
-def _gains(rows: Sequence[dict[str, Any]], heads: Sequence[str], names: Sequence[str]) -> str:
+def _gains(
+    gains: Sequence[dict[str, Any]],
+    rows: Sequence[dict[str, Any]],
+    heads: Sequence[str],
+    names: Sequence[str],
+) -> str:
     lines = []
-    for row in rows:
-        measures = [_interval(row[measure]) for measure in _MEASURES]
-        planners = [str(row[name]) for name in names]
-        place = [row["job"], row["site"], *planners, str(row["budget"])]
-        lines.append([*place, str(row["cost"]["piles"]), *measures])
+    for gain in gains:
+        planners = []
+        for name in names:
+            budget = gain["budget"] if name == "planner" else 1
+            case = gain["job"], gain["site"], gain[name], budget
+            planners.append(gain[name] + _mark([row for row in rows if _case(row) == case]))
+        measures = [_interval(gain[measure]) for measure in _MEASURES]
+        place = [gain["job"], gain["site"], *planners, str(gain["budget"])]
+        lines.append([*place, str(gain["cost"]["piles"]), *measures])
     head = ["job", "truck", *heads, "budget", "piles", "cost", "time a tonne", "work a tonne"]
     return _table(head, lines)
+
+
+def _case(row: dict[str, Any]) -> tuple[str, str, str, int]:
+    return row["job"], row["site"], row["planner"], row["budget"]
 
 
 def _interval(of: dict[str, Any]) -> str:
