@@ -184,7 +184,7 @@ def test_what_is_played_is_counted(plans: dict[str, PlanResult]) -> None:
     assert plans["cma_es"].spent == pytest.approx(start + (3 * 8 + 3) * 2 * one)
     # Fifteen poses: at the roots of both trees, with their ways, and at the nodes of the first that
     # go on; these are played, and the two loads that are made.
-    ways, at_poses = 15 * 0.3, 15 * 20 * 0.25 + 15 * 12 / 60
+    ways, at_poses = 15 * 0.3, 15 * 20 * 0.25 + 15 * 12 / 150
     nodes = (plans["tree_search"].spent - 2 - 2 * (at_poses + ways)) / (at_poses + 1)
     assert nodes == pytest.approx(round(nodes))
     assert round(nodes) in range(5, 8)
