@@ -17,6 +17,7 @@ root_doc = "docs/index"
 include_patterns = [
     "docs/**.md",
     "experiments/README.md",
+    "experiments/results/*.md",
     "CONTRIBUTING.md",
     "CHANGELOG.md",
     "SECURITY.md",
