@@ -311,24 +311,14 @@ def cost_as_played(
             yielded.
         last: After them.
     """
-    count, leaves = len(loads), None
-    if truck is not None:
-        leaves = np.asarray(leaves_after(jnp.asarray(truck)))[:count]
-    before, dug, performance = jax.tree.map(
-        lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *loads
-    )
-    dug = dug.replace(truck=None if truck is None else np.asarray(truck)[:count])
-    costs = _costs_as_played(counting(job), (before, dug, performance, leaves))
-    return float(np.asarray(costs).sum() + job.amount.rest(last.done))
-
-
-def _cost_as_played(counted: Job, load: Any) -> Float[Array, ""]:
-    before, dug, performance, leaves = load
-    cost: Array = assess(counted, before, dug, performance, leaves=leaves)[0].cost
-    return cost
-
-
-_costs_as_played = ParallelMap(_cost_as_played, on_core=_cost_as_played)
+    counted, cost = counting(job), 0.0
+    leaves = None if truck is None else np.asarray(leaves_after(jnp.asarray(truck)))
+    # One by one: together they would be many piles.
+    for n, (before, dug, performance) in enumerate(loads):
+        dug = dug.replace(truck=None if truck is None else np.asarray(truck)[n])
+        last_one = None if leaves is None else leaves[n]
+        cost += float(assess(counted, before, dug, performance, leaves=last_one)[0].cost)
+    return cost + float(job.amount.rest(last.done))
 
 
 def leaves_after(truck: Int[Array, " n"]) -> Bool[Array, " n"]:
