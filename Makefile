@@ -4,7 +4,8 @@
 # make test-lowest  a part of the tests with the lowest versions that pyproject.toml allows
 # make test-newest  the same with the newest there are, on the newest Python at hand
 # make fuzz      search for faults with random input; SECONDS=600 says how long
-# make soak      10,000 random plans in each world, and 100 kills of collect and of train: two hours
+# make soak      all that docs/reliability.md has figures of: faults on purpose, soils and machines,
+#                10,000 random plans in each world, 100 kills of collect and of train; two hours
 # make audit     what is installed by extra, its versions and licences, and what is known to be unsafe
 # make lint      style, types, imports
 # make docs      the documentation as a site, in out/docs/html; needs no network once it is installed
@@ -89,8 +90,10 @@ test-lowest test-newest: test-%: $(VENV)-%/.tools
 fuzz: $(VENV)/.tools
 	$(BIN)/python tests/fuzz.py --seconds $(SECONDS)
 
+SOAK_TESTS := $(addprefix tests/test_,faults.py corners.py random_plans.py kills.py)
+
 soak: $(VENV)/.tools
-	$(BIN)/python -m pytest -n 0 -rP -m slow --plans 10000 --kills 100 tests/test_random_plans.py tests/test_kills.py
+	$(BIN)/python -m pytest -n 0 -rP -m "slow or not slow" --plans 10000 --kills 100 $(SOAK_TESTS)
 
 # pip-audit asks a data base in the net; where there is none, only that part is left out.
 audit: $(VENV)/.tools
