@@ -329,6 +329,32 @@ def test_a_world_of_a_single_model_does_not(data: Dataset, site: tuple[Pile, Pos
     pose = jax.tree.map(lambda leaf: leaf[0], poses)
     with pytest.raises(InputError, match="--members"):
         LearnedWorld(single).uncertainty(pile, pose, action_from(ACTION))
+    # Nor is there a part of it.
+    assert LearnedWorld(single).roughly().performance is single
+
+
+def test_roughly_it_is_its_first_members(
+    saved: tuple[Path, Ensemble, EvaluationReport], site: tuple[Pile, Pose]
+) -> None:
+    whole, (pile, poses) = saved[1], site
+    part = whole.roughly()
+    assert part.size < whole.size
+    view = jnp.array([0.4, 0.5, 0.0, 0.1])
+    told = []
+    for k in range(part.size):
+        params = jax.tree.map(lambda leaf, k=k: leaf[k], whole.members.params)
+        told.append(of_view(whole.members.replace(params=params), view))
+    mean, deviation = with_deviation(part, view)
+    added = whole.bias * deviation / whole.factor
+    np.testing.assert_allclose(mean, np.mean(told, axis=0) + added, rtol=1e-5)
+    # As a world it foresees about the same, and is as differentiable.
+    pose = jax.tree.map(lambda leaf: leaf[0], poses)
+    world = LearnedWorld(whole)
+    rough, exact = (
+        flat(one.foresee(pile, pose, action_from(ACTION))) for one in (world.roughly(), world)
+    )
+    np.testing.assert_allclose(rough, exact, rtol=0.2)
+    assert (rough != exact).any()
 
 
 def test_without_intervals_a_report_is_as_it_was(data: Dataset) -> None:
