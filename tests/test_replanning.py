@@ -84,7 +84,10 @@ def test_trucks_are_filled_by_what_the_scale_says() -> None:
         told.append(0.7 * float(performance.mass))
         planner.loaded(told[-1])
         assert len(told) < 8
-    assert 0.95 * 8.0 <= sum(told) <= 1.10 * 8.0
+    # The last was to fit, and holds less than the world said like all others. What is short of that
+    # costs less than one bucket more.
+    last = told[-1] / 0.7
+    assert 0.95 * 8.0 - 0.3 * last <= sum(told) <= 1.10 * 8.0
     with pytest.raises(InputError, match="the job is done"):
         planner.next_load(pile)
 
