@@ -62,7 +62,8 @@ def _by_pile(rows: Sequence[dict[str, Any]], cell: Any) -> str:
         here = [row for row in rows if row["site"] == site]
         for planner, budget in sorted({(row["planner"], row["budget"]) for row in here}):
             own = [r for r in here if (r["planner"], r["budget"]) == (planner, budget)]
-            cells = [cell([row for row in own if row["pile"] == pile]) for pile in piles]
+            of_piles = [[row for row in own if row["pile"] == pile] for pile in piles]
+            cells = [cell(of_pile) if of_pile else _NONE for of_pile in of_piles]
             search = statistics.median(float(row["seconds"]) for row in own)
             name = planner + _mark(own)
             lines.append([site, name, str(budget), *cells, f"{search:.0f}"])
@@ -78,8 +79,6 @@ def _mean(rows: Sequence[dict[str, Any]], value: Any) -> float:
 
 
 def _costs(rows: Sequence[dict[str, Any]]) -> str:
-    if not rows:
-        return _NONE
     played = f"{_mean(rows, lambda row: row['simulator']['cost']):.2f}"
     # What is planned in the simulator is foreseen by it.
     if rows[0]["planner"].endswith(IN_REFEREE):
@@ -88,14 +87,10 @@ def _costs(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _a_tonne(rows: Sequence[dict[str, Any]]) -> str:
-    if not rows:
-        return _NONE
     return f"{_mean(rows, lambda row: row['simulator']['time'] / row['simulator']['mass']):.2f}"
 
 
 def _emptied(rows: Sequence[dict[str, Any]]) -> str:
-    if not rows:
-        return _NONE
     loads, time, stalls, missing = (
         _mean(rows, lambda row, name=name: row["simulator"][name])
         for name in ("loads", "time", "stalls", "missing")

@@ -52,7 +52,6 @@ class Grown(NamedTuple):
     decision: Decisions  # with its truck
     dug: LoadingPlan
     performance: Performance
-    before: Standing
     standing: Standing  # after it
     memory: Memory  # for the next
     cost: float  # of it, without the wait for a truck
@@ -128,11 +127,10 @@ class Greedy(LoadSearch):
             after, truck, cost = _made(job.amount, standing, yields, outlook, score)
             if not job.amount.is_worth(float(after.done.mass - standing.done.mass)):
                 break
-            decision, dug = decision.replace(truck=truck), played.dug.replace(truck=truck)
+            standing, decision = after, decision.replace(truck=truck)
             made.append(
-                Grown(decision, dug, played.performance, standing, after, memory, float(cost))
+                Grown(decision, played.dug, played.performance, standing, memory, float(cost))
             )
-            standing = after
             if says:
                 watch.keep(plan_of(job, made, loads), -math.inf)
                 watch(self.stage, len(made), loads, cost_of(job, made))
@@ -179,8 +177,11 @@ def plan_of(job: Job, made: Sequence[Grown], loads: int) -> Decisions:
 def cost_by_thorough_ways(job: Job, made: Sequence[Grown], loads: int) -> float:
     """What the plan costs as it was played, the ways searched for as thoroughly as in a result."""
     truck = plan_of(job, made, loads).truck
-    rows = [(one.before, one.dug, one.performance) for one in made]
-    return cost_as_played(judged(job), truck, rows, made[-1].standing)
+    standings = [beginning(job), *(one.standing for one in made)]
+    rows = [
+        (before, one.dug, one.performance) for before, one in zip(standings, made, strict=False)
+    ]
+    return cost_as_played(judged(job), truck, rows, standings[-1])
 
 
 def cost_of(job: Job, made: Sequence[Grown]) -> float:
