@@ -79,6 +79,27 @@ def test_each_load_gets_what_is_cheapest_there(pile: Pile) -> None:
     np.testing.assert_allclose(made.plan.action.k_bm, [3.5, 2.0, 2.0, 3.5])
 
 
+def test_a_load_that_fails_since_another_was_mended_is_mended_too(pile: Pile) -> None:
+    """Each dig of little gain leaves the pile lower, and there no other digs get on."""
+
+    def soft(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+        _, foreseen = hoped(pile, pose, action)
+        gentle = action.k_bm < 3.0
+        stuck = ~gentle & ((pose.y > 0.0) | (pile.height.max() < 1.95))
+        lower = pile.replace(height=pile.height - jnp.where(gentle, 0.1, 0.0))
+        return lower, foreseen.replace(time=jnp.where(stuck, 21.0, foreseen.time))
+
+    assert 1.95 < float(pile.height.max()) < 2.05
+    plan = plan_of([4.0, 5.0, 4.5, 2.0], [-0.5, 0.5, -0.3, -0.2])
+    left = chosen(pile, plan, soft, mend=False)
+    assert left.refereed is not None
+    np.testing.assert_allclose(left.refereed.rollout.performance.time, [8.0, 21.0, 7.75, 9.0])
+    made = chosen(pile, plan, soft)
+    np.testing.assert_allclose(made.plan.action.k_bm, [4.0, 2.0, 2.0, 2.0])
+    assert made.refereed is not None
+    np.testing.assert_allclose(made.refereed.rollout.performance.time, [8.0, 9.0, 9.0, 9.0])
+
+
 @pytest.mark.parametrize(
     ("k_bm", "y"),
     [

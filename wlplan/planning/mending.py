@@ -10,13 +10,21 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Array, Bool
 
-from wlplan.planning.job import Decisions, Job
-from wlplan.planning.playing import PlanResult, outcomes
-from wlplan.types import LoadingPlan
+from wlplan.parallel import ParallelMap
+from wlplan.planning.job import Decisions, Job, Standing, beginning
+from wlplan.planning.playing import (
+    LoadMade,
+    LoadOfPlan,
+    PlanResult,
+    assemble_loads,
+    loads_of,
+    play_load,
+)
+from wlplan.types import Action, LoadingPlan, Performance
+from wlplan.xla import on_device
 
 # A load has failed if its filling takes so many times as long as foreseen, or brings so little of
 # the mass. A stall takes more than twice as long. The cost is no measure of that: it has the way in
@@ -29,10 +37,10 @@ _TRIED = 8
 def mended(
     referee: Job, plan: Decisions | LoadingPlan, foreseen: PlanResult, played: PlanResult
 ) -> PlanResult | None:
-    """The plan with other actions for the loads that failed, as the referee plays it.
+    """The plan with other actions for the loads that fail, as the referee plays it.
 
-    Actions of the loads that went well are tried at all that did not, each in a play of the whole
-    plan; of each load the one that was cheapest there goes into one more plan.
+    It is played once more. Where a load fails, actions of the loads that went well are tried on
+    the pile as it is by then, and the cheapest load is made.
 
     Args:
         referee: The job in the world that plays.
@@ -41,41 +49,48 @@ def mended(
         played: The plan in the referee.
 
     Returns:
-        The cheapest of these plans in the referee; None if none is cheaper than what was played.
+        The plan with its new actions in the referee; None if nothing failed, nothing went well, or
+        it is not cheaper than what was played.
     """
-    costs = np.asarray(played.costs)
-    own = np.arange(len(costs))
-    made = np.ones(len(own), bool) if plan.truck is None else np.asarray(plan.truck) >= 0
-    hoped, found = (one.rollout.performance for one in (foreseen, played))
-    slow = np.asarray(found.time) > _SLOW * np.asarray(hoped.time)
-    failed = made & (slow | (np.asarray(found.mass) < _LIGHT * np.asarray(hoped.mass)))
+    made = np.ones(len(played.costs), bool) if plan.truck is None else np.asarray(plan.truck) >= 0
+    hoped = foreseen.rollout.performance
+    failed = made & _failed(hoped, played.rollout.performance)
     well = np.flatnonzero(made & ~failed)
     if not failed.any() or not len(well):
         return None
-    well = well[np.argsort(costs[well])][:_TRIED]
-    # Whose action each load has, in every plan that is tried.
-    rows = np.where(failed, well[:, None], own)
-    tried = _play(referee, plan, rows)
-    at_load = np.concatenate([costs[None], np.asarray(tried.costs)])
-    cheapest = np.nan_to_num(at_load, nan=np.inf).argmin(axis=0)
-    last = np.where(failed, np.concatenate([own[None], rows])[cheapest, own], own)
-    both = jax.tree.map(
-        lambda *leaves: jnp.concatenate(leaves), tried, _play(referee, plan, last[None])
-    )
-    totals = np.nan_to_num(np.asarray(both.cost), nan=np.inf)
-    best = int(totals.argmin())
-    if not totals[best] < float(played.cost):
-        return None
-    one: PlanResult = jax.tree.map(lambda leaf: leaf[best], both)
-    return one
+    well = well[np.argsort(np.asarray(played.costs)[well])][:_TRIED]
+    actions = _row(plan.action, well)
+    standing, loads = beginning(referee), []
+    for number, load in enumerate(loads_of(plan)):
+        one = play_load(referee, standing, load)
+        if made[number] and _failed(_row(hoped, number), one.assessed.performance):
+            one = _cheapest(one, _with_actions((referee, standing, load), actions))
+        loads.append(one)
+        standing = one.standing
+    better = assemble_loads(referee, loads)
+    return better if float(better.cost) < float(played.cost) else None
 
 
-def _play(referee: Job, plan: Decisions | LoadingPlan, rows: Int[np.ndarray, "k n"]) -> PlanResult:
-    """Plays the plan with actions of other loads of it."""
+def _failed(hoped: Performance, found: Performance) -> Bool[np.ndarray, "*n"]:
+    slow = np.asarray(found.time) > _SLOW * np.asarray(hoped.time)
+    light = np.asarray(found.mass) < _LIGHT * np.asarray(hoped.mass)
+    return np.asarray(slow | light)
 
-    def with_actions(of: Int[np.ndarray, " n"]) -> Any:
-        return plan.replace(action=jax.tree.map(lambda leaf: leaf[of], plan.action))
 
-    plans = [with_actions(of) for of in rows]
-    found: PlanResult = outcomes(referee, jax.tree.map(lambda *leaves: jnp.stack(leaves), *plans))
-    return found
+def _cheapest(own: LoadMade, tried: LoadMade) -> LoadMade:
+    """The cheapest of a load and others in its place, leaves [k]."""
+    costs = np.array([own.assessed.cost, *tried.assessed.cost])
+    best = int(np.nan_to_num(costs, nan=np.inf).argmin())
+    return own if best == 0 else _row(tried, best - 1)
+
+
+def _row(tree: Any, row: Any) -> Any:
+    return jax.tree.map(lambda leaf: on_device(np.asarray(leaf)[row]), tree)
+
+
+def _with_action(shared: tuple[Job, Standing, LoadOfPlan], action: Action | Array) -> LoadMade:
+    referee, standing, load = shared
+    return play_load(referee, standing, load._replace(one=load.one.replace(action=action)))
+
+
+_with_actions = ParallelMap(_with_action, on_core=_with_action)

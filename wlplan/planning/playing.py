@@ -274,26 +274,57 @@ def _without(job: Job, *names: str) -> Job:
     return part
 
 
-def play_by_load(job: Job, candidate: Decisions | LoadingPlan) -> PlanResult:
-    """`play_candidate` outside of any trace, one load after the other.
+class LoadOfPlan(NamedTuple):
+    """A load as a plan has it, without leading axes."""
 
-    It compiles the world and what counts a load for themselves: half of what the whole takes, and
-    the same for each number of loads.
-    """
+    one: Decisions | LoadingPlan
+    leaves: Bool[Array, ""] | None  # whether the truck leaves after it; None: no trucks
+
+
+class LoadMade(NamedTuple):
+    """A load that was played, and where it leaves the job."""
+
+    assessed: Assessed
+    known: Known
+    standing: Standing  # after it
+
+
+def loads_of(candidate: Decisions | LoadingPlan) -> list[LoadOfPlan]:
+    """The loads of a plan, leaves [N], one by one."""
     leaves = None if candidate.truck is None else leaves_after(jnp.asarray(candidate.truck))
     tree: Any
-    columns, tree = jax.tree.flatten((candidate, leaves))
+    columns, tree = jax.tree.flatten(LoadOfPlan(candidate, leaves))
+    # By numpy, as below: each number of loads would be compiled for.
     columns = [np.asarray(column) for column in columns]
-    standing, counted, rows = beginning(job), counting(job), []
-    for n in range(len(columns[0])):
-        one, last = tree.unflatten(column[n] for column in columns)
-        dug, played = play_one(job, standing, one)
-        assessed, done = assess(counted, standing, dug, played.performance, leaves=last)
-        standing = Standing(played.pile, done)
-        rows.append((assessed, played.known))
-    # By numpy: each number of loads would be compiled for.
-    loadings, known = jax.tree.map(lambda *leaves: on_device(np.stack(leaves)), *rows)
-    return assemble(job, loadings, standing, known)
+    return [tree.unflatten(row) for row in zip(*columns, strict=True)]
+
+
+def play_load(job: Job, standing: Standing, load: LoadOfPlan) -> LoadMade:
+    """Plays a load outside of any trace, and counts it.
+
+    It compiles the world and what counts a load for themselves: half of what a whole plan takes,
+    and the same for each number of loads.
+    """
+    dug, played = play_one(job, standing, load.one)
+    made, done = assess(counting(job), standing, dug, played.performance, leaves=load.leaves)
+    return LoadMade(made, played.known, Standing(played.pile, done))
+
+
+def assemble_loads(job: Job, loads: Sequence[LoadMade]) -> PlanResult:
+    """Loads that were played in order, as a result."""
+    assessed, known = jax.tree.map(
+        lambda *leaves: on_device(np.stack(leaves)), *(load[:2] for load in loads)
+    )
+    return assemble(job, assessed, loads[-1].standing, known)
+
+
+def play_by_load(job: Job, candidate: Decisions | LoadingPlan) -> PlanResult:
+    """`play_candidate` outside of any trace, one load after the other."""
+    standing, made = beginning(job), []
+    for load in loads_of(candidate):
+        made.append(play_load(job, standing, load))
+        standing = made[-1].standing
+    return assemble_loads(job, made)
 
 
 def cost_as_played(
