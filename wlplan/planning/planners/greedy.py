@@ -189,21 +189,35 @@ def cost_of(job: Job, made: Sequence[Grown]) -> float:
     return sum(one.cost for one in made) + float(job.amount.rest(made[-1].standing.done))
 
 
+def scores_in_referee(
+    job: Job, standing: Standing, found: Ranked, outlook: Outlook
+) -> tuple[Float[np.ndarray, " k"], LoadPlayed]:
+    """Scores of loads by what the referee makes of them, infinite where there is none, and that.
+
+    Args:
+        job: With its toe and referee.
+        standing: Before the load.
+        found: The loads, leaves [K].
+        outlook: What the loads after it will be like.
+    """
+    shared, loads = (judged(job), standing, outlook), (found.decisions, found.cusps)
+    scores, *played = _scores_as_played(shared, loads)
+    return np.nan_to_num(np.asarray(scores), nan=np.inf), LoadPlayed(*played)
+
+
 def _best_in_referee(
     job: Job, standing: Standing, found: Ranked, outlook: Outlook, watch: Watch
 ) -> Chosen:
     """The cheapest in the referee of those that have to be played there, see `Greedy`."""
-    shared, loads = (judged(job), standing, outlook), (found.decisions, found.cusps)
     order = np.argsort(found.scores)
     chosen: Chosen | None = None
     for first in range(0, len(order), _AT_ONCE):
         rows, following = np.split(order[first:], [_AT_ONCE])
         watch.spend(loading=len(rows))
-        scores, *played = _scores_as_played(shared, _row(loads, rows))
-        scores = np.nan_to_num(np.asarray(scores), nan=np.inf)
+        scores, played = scores_in_referee(job, standing, _row(found, rows), outlook)
         best = int(np.argmin(scores))
         if chosen is None or scores[best] < chosen.score:
-            decision, one = _row(found.decisions, rows[best]), LoadPlayed(*_row(played, best))
+            decision, one = _row(found.decisions, rows[best]), _row(played, best)
             chosen = Chosen(decision, float(scores[best]), one)
         if len(following):
             foreseen = float(found.scores[following[0]])
