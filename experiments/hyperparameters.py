@@ -155,6 +155,9 @@ def run(preset: str, data: Dataset, rows: dict[str, dict[str, Any]]) -> dict[str
             }
             for title, part in parts.items()
         },
+        # Collected on so many kinds of processor, see `training_rows.recipe`.
+        "datasets": len({rows[one.name]["dataset"] for one in done}),
+        "trainings_timed": len(timed),
         "hours_taken": sum(rows[one.name]["training_s"] for one in timed) / 3600.0,
         "hours_foreseen_for_these": sum(one.cost for one in timed) / 3600.0,
         "columns": list(table[0]) if table else [],

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import json
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from experiments import (
     reliability,
     sequential_loading,
 )
+from experiments._common import training_rows
 from experiments._common.models import load_or_train as trained
 from experiments._common.training_rows import train_row
 from wlplan.constants import CELL_SIZE
@@ -181,6 +183,31 @@ def test_a_row_of_a_training_leaves_no_model_behind(tmp_path: Path) -> None:
     assert row["epochs"] == 2
     assert sum(row["cycles"]) == len(data)
     assert 0.0 < row["epoch_s"] < row["training_s"]
+
+
+def test_rows_that_are_committed_are_not_made_again(tmp_path: Path) -> None:
+    folder = tmp_path / "rows"
+    folder.mkdir()
+    (folder / "a.json").write_text('{"parameters": 1}')
+    kept = tmp_path / "kept.json"
+    training_rows._unpack(kept, folder)
+    kept.write_text('{"a": {"parameters": 2},\n"b": {"parameters": 3}}\n')
+    training_rows._unpack(kept, folder)
+    found = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
+    assert found == {"a": {"parameters": 1}, "b": {"parameters": 3}}
+
+
+def test_a_row_serves_the_same_cycles_of_another_processor_and_no_others() -> None:
+    data = synthetic(rollouts=2, loads=3)
+    off = dataclasses.replace(data, mass=data.mass * np.float32(1.0 + 1e-6))
+    assert fingerprint(off) != fingerprint(data)
+    made = training_rows.made_with(PsiLowSettings(), data)
+    assert training_rows.made_with(PsiLowSettings(), off) == made
+    for name, value in (("seed", 12345), ("loads", 7)):
+        other = dataclasses.replace(data, attributes={**data.attributes, name: value})
+        assert training_rows.made_with(PsiLowSettings(), other) != made
+    fewer = synthetic(rollouts=2, loads=2)
+    assert training_rows.made_with(PsiLowSettings(), fewer) != made
 
 
 # --- noise floor

@@ -1,9 +1,15 @@
-"""Trainings as rows: errors, times and size of performance predictors, without their weights."""
+"""Trainings as rows: errors, times and size of performance predictors, without their weights.
+
+The rows are committed beside the result that they come to: so a new machine goes on where the last
+one ended.
+"""
 
 from __future__ import annotations
 
 import argparse
 import functools
+import hashlib
+import json
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -14,7 +20,7 @@ import jax
 import numpy as np
 from flax import nnx
 
-from experiments._common.places import add_places, folder_of, say
+from experiments._common.places import RESULTS, add_places, folder_of, say
 from experiments._common.results import add_data, data_of, redraw, write_result
 from experiments._common.row_files import (
     RowFiles,
@@ -26,6 +32,7 @@ from experiments._common.row_files import (
 from wlplan import training
 from wlplan.dataset import Dataset, fingerprint
 from wlplan.errors import InputError
+from wlplan.io import write_text_atomic
 from wlplan.io.provenance import versions
 from wlplan.models.storage import read_description
 from wlplan.studies.bench.inference import performance_times
@@ -48,14 +55,29 @@ class Training(Protocol):
 AnyTraining = TypeVar("AnyTraining", bound=Training)
 
 
-def made_with(settings: PerformanceSettings, data_mark: str) -> dict[str, Any]:
+# Attributes of a data set that its cycles do not hang on.
+_NOT_OF_THE_CYCLES = ("format", "title", "command", "versions", "cycles_done")
+
+
+def recipe(data: Dataset) -> str:
+    """A hash of what the cycles of a data set were made from.
+
+    Not of the cycles themselves: between processors they differ in the last digits, which no
+    training tells.
+    """
+    attributes = {k: v for k, v in data.attributes.items() if k not in _NOT_OF_THE_CYCLES}
+    text = json.dumps({**attributes, "cycles": len(data)}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def made_with(settings: PerformanceSettings, data: Dataset) -> dict[str, Any]:
     """What the row of a training hangs on.
 
     Args:
         settings: How it is trained.
-        data_mark: Fingerprint of the data set, which takes a while to make.
+        data: Data set to train on.
     """
-    return {"settings": settings.as_dict(), "dataset": data_mark, "versions": versions()}
+    return {"settings": settings.as_dict(), "recipe": recipe(data), "versions": versions()}
 
 
 def train_row(settings: PerformanceSettings, data: Dataset, place: Path) -> dict[str, Any]:
@@ -95,6 +117,7 @@ def train_row(settings: PerformanceSettings, data: Dataset, place: Path) -> dict
         "training_s": clock[-1] - clock[0] if len(clock) == record["epochs"] + 1 else None,
         "inference_s": one.call.median,
         "inference_of_a_batch_s": batch.each,
+        "dataset": fingerprint(data),
     }
     shutil.rmtree(place)
     # Each training has programs of its own, which would add up.
@@ -144,14 +167,17 @@ def main(
         # Parts that are started together find the data that the first of them collects.
         with rows.alone("data set"):
             data = data_of(options, folder)
-        mark = fingerprint(data)
+        if not smoke:
+            _unpack(RESULTS / _kept(name), rows.folder)
         every = trainings(options.preset)
         if not options.join:
             todo = [one for one in every if options.whole or smoke or first(one)]
             mine = part_of(matching(todo, options.only), options.shard)
-            _make(mine, rows, data, mark, time_is_up(options))
-        found = {one.name: rows.read(one.name, made_with(one.settings, mark)) for one in every}
+            _make(mine, rows, data, time_is_up(options))
+        found = {one.name: rows.read(one.name, made_with(one.settings, data)) for one in every}
         there = {key: row for key, row in found.items() if row is not None}
+        lines = ",\n".join(f"{json.dumps(key)}: {json.dumps(row)}" for key, row in there.items())
+        write_text_atomic(folder / _kept(name), f"{{{lines}}}\n")
         write_result(name, options.preset, run(options.preset, data, there), folder)
         draw(folder)
     except InputError as error:
@@ -160,11 +186,26 @@ def main(
     say(f"{name}: done, see {folder / name}.json and .png")
 
 
+def _kept(name: str) -> str:
+    """File of the rows of an experiment, beside its result."""
+    return f"{name}_rows.json"
+
+
+def _unpack(kept: Path, folder: Path) -> None:
+    """Lays committed rows where rows are made, so that none is made twice; what is there stays."""
+    if not kept.exists():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, row in json.loads(kept.read_text()).items():
+        path = folder / f"{name}.json"
+        if not path.exists():
+            write_text_atomic(path, json.dumps(row) + "\n")
+
+
 def _make(
     todo: Sequence[Training],
     rows: RowFiles,
     data: Dataset,
-    mark: str,
     is_up: Callable[[], bool],
 ) -> None:
     """Makes the rows that are not there yet."""
@@ -174,5 +215,5 @@ def _make(
         settings, place = one.settings, rows.folder / ".models" / one.name
         say(f"{number} of {len(todo)}: {one.name}")
         rows.get(
-            one.name, made_with(settings, mark), functools.partial(train_row, settings, data, place)
+            one.name, made_with(settings, data), functools.partial(train_row, settings, data, place)
         )
