@@ -325,4 +325,4 @@ def test_everything_quickly(run: Run) -> None:
         figures = set(record["figures"]) - set(cli.benchmark._FIGURES)
         assert not figures
     skipped = {record["name"] for record in document["items"] if record["run"] is None}
-    assert skipped <= {"gpu-rollouts", "plan", "first-load", "numba", "aeolis"}
+    assert skipped <= {"gpu-rollouts", "plan", "first-load", "next-load", "numba", "aeolis"}

@@ -16,7 +16,8 @@ from wlplan.cli.said import say
 ITEMS = (
     *("avalanche", "avalanche-gradient", "avalanche-batch", "loading", "rollout"),
     *("rollout-gradient", "psi-low", "psi-low-batch", "gpu-rollouts", "cycles", "plan"),
-    *("first-load", "map", "map-optimised", "settle", "xla", "numba", "numpy", "aeolis"),
+    *("first-load", "next-load", "map", "map-optimised", "settle", "xla", "numba", "numpy"),
+    "aeolis",
 )
 # How the figures of an item are written.
 _FIGURES: dict[str, Callable[[float], str]] = {
@@ -31,6 +32,7 @@ _FIGURES: dict[str, Callable[[float], str]] = {
     "cycles_per_second": lambda v: f"{v:.0f} a second",
     "loads_per_second": lambda v: f"{v:.0f} loads a second",
     "processor_seconds": lambda v: f"{_duration(v)} of all cores",
+    "nine_of_ten": lambda v: f"nine of ten {_duration(v)}",
     "seconds_on_another_pile": lambda v: f"{_duration(v)} on another pile",
 }
 
