@@ -39,6 +39,11 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "one heading a pose": {"offsets": (0.0,)},
     "12 actions": {"actions": 12},
     "48 actions": {"actions": 48},
+    "3 poses a metre, 12 actions, a way for four": {
+        "poses_per_metre": 3.0,
+        "actions": 12,
+        "neighbours": 4,
+    },
     "a way for each pose": {"neighbours": 1},
     "4 refined": {"refined": 4},
     "16 refined": {"refined": 16},

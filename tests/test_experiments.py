@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -43,6 +44,9 @@ def test_the_smoke_preset_writes_numbers_and_a_picture(
 ) -> None:
     needs = inspect.signature(importlib.import_module(f"experiments.{name}").run).parameters
     places = [[f"--{what}", str(place)] for what, place in shared.items() if what in needs]
+    # Each is a process; what one has traced serves the next.
+    traces = ROOT / ".pytest_cache" / "traces"
+    traces.mkdir(parents=True, exist_ok=True)
     subprocess.run(
         [
             *(sys.executable, "-m", f"experiments.{name}", "--preset", "smoke"),
@@ -52,6 +56,7 @@ def test_the_smoke_preset_writes_numbers_and_a_picture(
         check=True,
         cwd=ROOT,
         capture_output=True,
+        env=os.environ | {"WLPLAN_TRACES": str(traces)},
     )
     result = json.loads((tmp_path / f"{name}.json").read_text())
     assert result["preset"] == "smoke"
