@@ -266,7 +266,10 @@ def draw(folder: Path) -> None:
         middle.plot(plays, more, "o-", color=colour, ms=4, lw=1.0, label=f"{at_once} at once")
         for rule, x, y in zip(rules, plays, more, strict=True):
             text = f"{100.0 * rule['as_foreseen']:g} %"
-            middle.annotate(text, (x, y), (4, 4), textcoords="offset points", size=7)
+            # Those of two at once lie close: theirs in turn above and below.
+            above = at_once == 1 or rule["as_foreseen"] != AS_FORESEEN[1]
+            at = (4, 4) if above else (4, -9)
+            middle.annotate(text, (x, y), at, textcoords="offset points", size=7)
     middle.set_xlabel(f"plays in the referee, of {result['referee'][0]['of']:g}", fontsize=8)
     middle.set_ylabel("score more than if all are played [%]", fontsize=8)
     middle.set_title("until one is as foreseen to", fontsize=9)
@@ -274,10 +277,12 @@ def draw(folder: Path) -> None:
     for row, colour in zip(result["gains"], (ORANGE, BLUE, GREEN), strict=False):
         less = [100.0 * one["mean"] for one in row["less"]]
         numbers = np.arange(1, len(less) + 1)
-        right.plot(numbers, less, "o-", color=colour, ms=4, lw=1.0, label=str(row["starts"]))
+        right.plot(
+            numbers, less, "o-", color=colour, ms=4, lw=1.0, label=f"{row['starts']} from nothing"
+        )
     right.set_xlabel("plans that were made", fontsize=8)
     right.set_ylabel("cost less than the first [%]", fontsize=8)
-    right.set_title("plans from nothing, then made again", fontsize=9)
+    right.set_title("then loads are made again", fontsize=9)
     right.legend(frameon=False, fontsize=7)
     for panel in (left, middle, right):
         tidy(panel)
