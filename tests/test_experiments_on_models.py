@@ -142,12 +142,14 @@ def test_a_summary_says_how_much_of_the_grid_is_there() -> None:
         "mean_relative": {"mass": 0.1, "time": 0.2, "work": 0.3},
         **dict.fromkeys(("parameters", "epochs", "best_epoch"), 7),
         **dict.fromkeys(("epoch_s", "training_s", "inference_s", "inference_of_a_batch_s"), 0.5),
+        "dataset": "sha256:0",
     }
     result = hyperparameters.run("full", data, {one.name: row})
     assert result["parts"]["paper"]["done"] == int(one.kind != hyperparameters.OURS)
     assert result["parts"]["all"]["trainings"] == len(hyperparameters.runs("full"))
     (found,) = result["rows"]
     assert dict(zip(result["columns"], found, strict=True))["cycles"] == 100
+    assert result["datasets"] == 1
 
 
 def test_from_the_papers_protocol_every_step_changes_something_and_the_last_is_ours() -> None:

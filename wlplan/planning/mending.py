@@ -21,7 +21,7 @@ from wlplan.planning.playing import (
     PlanResult,
     assemble_loads,
     loads_of,
-    play_load,
+    make_load,
 )
 from wlplan.types import Action, LoadingPlan, Performance
 from wlplan.xla import on_device
@@ -62,7 +62,7 @@ def mended(
     actions = _row(plan.action, well)
     standing, loads = beginning(referee), []
     for number, load in enumerate(loads_of(plan)):
-        one = play_load(referee, standing, load)
+        one = make_load(referee, standing, load)
         if made[number] and _failed(_row(hoped, number), one.assessed.performance):
             one = _cheapest(one, _with_actions((referee, standing, load), actions))
         loads.append(one)
@@ -90,7 +90,7 @@ def _row(tree: Any, row: Any) -> Any:
 
 def _with_action(shared: tuple[Job, Standing, LoadOfPlan], action: Action | Array) -> LoadMade:
     referee, standing, load = shared
-    return play_load(referee, standing, load._replace(one=load.one.replace(action=action)))
+    return make_load(referee, standing, load._replace(one=load.one.replace(action=action)))
 
 
 _with_actions = ParallelMap(_with_action, on_core=_with_action)

@@ -299,7 +299,7 @@ def loads_of(candidate: Decisions | LoadingPlan) -> list[LoadOfPlan]:
     return [tree.unflatten(row) for row in zip(*columns, strict=True)]
 
 
-def play_load(job: Job, standing: Standing, load: LoadOfPlan) -> LoadMade:
+def make_load(job: Job, standing: Standing, load: LoadOfPlan) -> LoadMade:
     """Plays a load outside of any trace, and counts it.
 
     It compiles the world and what counts a load for themselves: half of what a whole plan takes,
@@ -322,7 +322,7 @@ def play_by_load(job: Job, candidate: Decisions | LoadingPlan) -> PlanResult:
     """`play_candidate` outside of any trace, one load after the other."""
     standing, made = beginning(job), []
     for load in loads_of(candidate):
-        made.append(play_load(job, standing, load))
+        made.append(make_load(job, standing, load))
         standing = made[-1].standing
     return assemble_loads(job, made)
 
