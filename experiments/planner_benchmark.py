@@ -365,23 +365,22 @@ def run(preset: str, rows: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
     }
 
 
-def unpack(result: Path, folder: Path) -> None:
+def unpack(result: Path, made: RowFiles) -> None:
     """Lays the rows of a committed result where rows are kept, so that none is made twice.
 
     Their plans are not kept, but for the best, see `BEST`.
 
     Args:
         result: JSON that `run` came to; nothing is done if it is not there.
-        folder: Of the rows; what is there is left as it is.
+        made: The rows; what is there is left as it is.
     """
     if not result.exists():
         return
-    folder.mkdir(parents=True, exist_ok=True)
+    rows = {}
     for row in json.loads(result.read_text())["rows"]:
         instance = Instance(row["pile"], row["job"], row["site"])
-        path = folder / f"{Run(instance, row['planner'], row['budget'], row['seed']).name}.json"
-        if not path.exists():
-            write_text_atomic(path, json.dumps({**row, "plan": {}}) + "\n")
+        rows[Run(instance, row["planner"], row["budget"], row["seed"]).name] = {**row, "plan": {}}
+    made.lay(rows)
 
 
 def _of_today(row: dict[str, Any]) -> bool:
@@ -462,7 +461,7 @@ def _make(options: argparse.Namespace, folder: Path) -> None:
     made = RowFiles(options.rows or (folder / ROWS.name if options.preset == "smoke" else ROWS))
     say(f"planner_benchmark: runs in {made.folder}; the result goes to {folder}")
     if options.preset != "smoke":
-        unpack(RESULTS / "planner_benchmark.json", made.folder)
+        unpack(RESULTS / "planner_benchmark.json", made)
     planners = PLANNERS | {name: _always(load_object(name)) for name in options.planner}
     chosen = tuple(SMOKE if options.preset == "smoke" else planners)
     if not options.join:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import json
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -185,18 +184,6 @@ def test_a_row_of_a_training_leaves_no_model_behind(tmp_path: Path) -> None:
     assert row["epochs"] == 2
     assert sum(row["cycles"]) == len(data)
     assert 0.0 < row["epoch_s"] < row["training_s"]
-
-
-def test_rows_that_are_committed_are_not_made_again(tmp_path: Path) -> None:
-    folder = tmp_path / "rows"
-    folder.mkdir()
-    (folder / "a.json").write_text('{"parameters": 1}')
-    kept = tmp_path / "kept.json"
-    training_rows._unpack(kept, folder)
-    kept.write_text('{"a": {"parameters": 2},\n"b": {"parameters": 3}}\n')
-    training_rows._unpack(kept, folder)
-    found = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
-    assert found == {"a": {"parameters": 1}, "b": {"parameters": 3}}
 
 
 def test_a_row_serves_the_same_cycles_of_another_processor_and_no_others() -> None:

@@ -218,12 +218,12 @@ def test_what_was_committed_is_not_made_again(tmp_path: Path) -> None:
     rows = [{**of, "predicted": 1.0, "made_with": benchmark.made_with(run, GREEDY)}]
     result, folder = tmp_path / "result.json", tmp_path / "rows"
     result.write_text(json.dumps({"rows": rows}))
-    benchmark.unpack(result, folder)
+    benchmark.unpack(result, RowFiles(folder))
     found = RowFiles(folder).read(run.name, benchmark.made_with(run, GREEDY))
     assert found == {**rows[0], "plan": {}}
     # What was made since stays.
     (folder / f"{run.name}.json").write_text("{}")
-    benchmark.unpack(result, folder)
+    benchmark.unpack(result, RowFiles(folder))
     assert RowFiles(folder).all() == [{}]
-    benchmark.unpack(tmp_path / "none.json", tmp_path / "none")
+    benchmark.unpack(tmp_path / "none.json", RowFiles(tmp_path / "none"))
     assert not (tmp_path / "none").exists()

@@ -44,6 +44,13 @@ def test_a_row_is_made_once_and_anew_where_it_hangs_on_something_else(tmp_path: 
     assert [row["number"] for row in rows.all()] == [1, 2]
 
 
+def test_rows_from_elsewhere_are_laid_beside_those_that_are_there(tmp_path: Path) -> None:
+    rows = RowFiles(tmp_path / "rows")
+    rows.lay({"a": {"number": 1}})
+    rows.lay({"a": {"number": 2}, "b": {"number": 3}})
+    assert rows.all() == [{"number": 1}, {"number": 3}]
+
+
 def test_a_row_that_another_process_makes_is_not_made_twice(tmp_path: Path) -> None:
     rows = RowFiles(tmp_path)
     code = (

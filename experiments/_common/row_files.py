@@ -8,7 +8,7 @@ import fnmatch
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -67,6 +67,14 @@ class RowFiles:
                 return made
         except filelock.Timeout:
             return None
+
+    def lay(self, rows: Mapping[str, dict[str, Any]]) -> None:
+        """Adds rows that were made elsewhere, by name; those that are there stay as they are."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for name, row in rows.items():
+            path = self.folder / f"{name}.json"
+            if not path.exists():
+                write_text_atomic(path, json.dumps(row) + "\n")
 
     @contextlib.contextmanager
     def alone(self, name: str, *, wait: bool = True) -> Iterator[None]:

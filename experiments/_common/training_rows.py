@@ -167,8 +167,9 @@ def main(
         # Parts that are started together find the data that the first of them collects.
         with rows.alone("data set"):
             data = data_of(options, folder)
-        if not smoke:
-            _unpack(RESULTS / _kept(name), rows.folder)
+        committed = RESULTS / _kept(name)
+        if not smoke and committed.exists():
+            rows.lay(json.loads(committed.read_text()))
         every = trainings(options.preset)
         if not options.join:
             todo = [one for one in every if options.whole or smoke or first(one)]
@@ -189,17 +190,6 @@ def main(
 def _kept(name: str) -> str:
     """File of the rows of an experiment, beside its result."""
     return f"{name}_rows.json"
-
-
-def _unpack(kept: Path, folder: Path) -> None:
-    """Lays committed rows where rows are made, so that none is made twice; what is there stays."""
-    if not kept.exists():
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, row in json.loads(kept.read_text()).items():
-        path = folder / f"{name}.json"
-        if not path.exists():
-            write_text_atomic(path, json.dumps(row) + "\n")
 
 
 def _make(
