@@ -63,6 +63,12 @@ def run(preset: str, data: Dataset) -> dict[str, Any]:
     return {
         "data": dataset_summary(data),
         "stop_reasons": np.bincount(data.stop_reason, minlength=4).tolist(),
+        # Of the time in which buckets fill, by what ends it: steps of the simulator go with it.
+        "parts_of_filling": (
+            np.bincount(data.stop_reason, data.fill_time, 4) / data.fill_time.sum()
+        )
+        .round(4)
+        .tolist(),
         "ranges": {name: _range(name, values) for name, values in outcomes.items()},
         "shape_ranges": {name: _percentiles(values) for name, values in shape.items()},
         "shape_correlations": np.corrcoef(
