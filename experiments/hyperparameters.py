@@ -42,8 +42,6 @@ LAYERS, UNITS = (1, 2, 3), tuple(2**n for n in range(3, 13))
 SAMPLES = (100, 1000, 3000, 0)
 # The paper's errors are means of five trainings.
 SEEDS = tuple(range(5))
-# What comes first: enough of it to see what the paper's figure shows.
-FIRST_UNITS, FIRST_SAMPLES = UNITS[::2], (100, 3000, 0)
 # Passes over all the data; over fewer cycles as many more as make this many steps at least.
 EPOCHS = {"psi_low": 150, "psi_high": 60, OURS: 150}
 LEAST_STEPS, BATCH = 3000, 128
@@ -52,6 +50,8 @@ _KNOWN, _TRAINED = 9_690, 8 / 9
 # At how many units the data vary, and on how many cycles the units, as in the paper's figure.
 UNITS_OVER_DATA = {"psi_low": 512, "psi_high": 2048, OURS: 512}
 SAMPLES_OVER_SIZE = {"psi_low": 3000, "psi_high": 0, OURS: 0}
+# What comes first is what these two need: the figure, with every other width.
+FIRST_UNITS, FIRST_SAMPLES = UNITS[::2], (100, 3000, 0)
 # Seconds of one core of an AMD EPYC: to start and compile, of a step, of each weight in it, and of
 # the convolutions.
 _START, _STEP, _WEIGHT, _CONVOLUTIONS = 12.0, 1.0e-3, 1.1e-8, 45e-3
@@ -77,7 +77,9 @@ class Run:
     @property
     def is_first(self) -> bool:
         """Whether it is of the part of the grid that comes first."""
-        return self.seed == 0 and self.units in FIRST_UNITS and self.samples in FIRST_SAMPLES
+        over_size = self.units in FIRST_UNITS and self.samples == SAMPLES_OVER_SIZE[self.kind]
+        over_data = self.units == UNITS_OVER_DATA[self.kind] and self.samples in FIRST_SAMPLES
+        return self.seed == 0 and (over_size or over_data)
 
     @property
     def settings(self) -> PerformanceSettings:
