@@ -17,6 +17,7 @@ from wlplan.planning.amounts import (
     Amount,
     Done,
     Empty,
+    Emptying,
     Loads,
     Made,
     Outlook,
@@ -109,6 +110,41 @@ def test_the_last_tonnes_are_counted_by_the_bucket() -> None:
     assert float(tonnes.to_go(far, outlook())) == pytest.approx(90.0 * 2.0 / 3.0, rel=1e-5)
     # Two tonnes are a bucket, whatever it holds.
     assert float(tonnes.to_go(near, outlook())) == pytest.approx(2.0)
+
+
+def test_of_loads_that_empty_a_pile_none_is_better_that_would_not_be_made() -> None:
+    emptying = Emptying(mass=100.0, least=0.8, follows=True)
+
+    def score(cost: float, mass: float) -> float:
+        masses = jnp.float32(mass)
+        counted = cost + emptying.shortfall(masses)
+        return float(counted + emptying.to_go(aboard(90.0 + mass), outlook()))
+
+    # It costs less a tonne than the other two.
+    too_small = score(0.3, 0.7)
+    assert all(too_small > score(cost, mass) for cost, mass in ((0.6, 0.8), (1.2, 1.5)))
+    # Of those that are made the price decides.
+    assert score(0.6, 0.8) > score(0.9, 1.5)
+    assert float(Tonnes(100.0).shortfall(jnp.float32(0.1))) == 0.0
+
+
+def test_of_a_pile_that_is_emptied_nothing_follows_where_no_load_was_worth_it() -> None:
+    found = Empty(0.1).of(cone(), SITE.soil).part(Made(), 4.5)
+    assert found is not None
+    assert found[1] == 16
+    emptying: Any = found[0].replace(price=0.5, mass=54.0)
+
+    def rest(loads: int, mass: float) -> float:
+        done = aboard(mass).replace(loads=jnp.asarray(loads, jnp.int32))
+        return float(emptying.rest(done))
+
+    # It went on to its last row, or to the last tonne: what is left is done in the next part.
+    assert rest(16, 40.0) == pytest.approx(0.5 * 14.0)
+    assert rest(12, 55.0) == pytest.approx(-0.5)
+    # It found no further load.
+    assert rest(12, 40.0) == pytest.approx(MISFIT_COST * 14.0)
+    of_tonnes: Any = Tonnes(54.0, follows=True, price=0.5)
+    assert float(of_tonnes.rest(aboard(40.0))) == pytest.approx(0.5 * 14.0)
 
 
 def test_parts_add_up_to_the_whole() -> None:

@@ -33,7 +33,7 @@ from wlplan.planning.planners.cross_entropy import _coloured
 from wlplan.planning.planners.greedy import cost_by_thorough_ways, cost_of, plan_of
 from wlplan.planning.playing import PlanResult, outcomes
 from wlplan.planning.population import Near, Spread
-from wlplan.planning.proposals import Proposals
+from wlplan.planning.proposals import NothingWorthIt, Proposals
 from wlplan.planning.watch import Watch
 from wlplan.types import Action, LoadingPlan, Pose
 
@@ -213,6 +213,29 @@ def test_iterated_greedy_begins_with_greedy_and_keeps_what_is_better(
         np.testing.assert_array_equal(a, b)
     costs = [float(plan(IteratedGreedy(rounds=r, greedy=GREEDY)).cost) for r in (0, 3)]
     assert costs[1] <= costs[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class LateGreedy(Greedy):
+    """Finds nothing now and then."""
+
+    misses: list[int] = dataclasses.field(default_factory=list)
+
+    def grow(self, *given: Any, **options: Any) -> Any:
+        """As the misses have it, from the last to the first."""
+        if self.misses and self.misses.pop():
+            raise NothingWorthIt
+        return super().grow(*given, **options)
+
+
+def test_iterated_greedy_tries_again_where_one_start_finds_nothing() -> None:
+    with pytest.raises(NothingWorthIt):
+        IteratedGreedy(starts=2, greedy=LateGreedy(**_SEARCH, misses=[1, 1])).propose(
+            job(), 2, seed=0
+        )
+    late = IteratedGreedy(starts=2, rounds=1, greedy=LateGreedy(**_SEARCH, misses=[1, 0, 1]))
+    found = late.propose(job(), 2, seed=0).candidates
+    assert np.isfinite(outcomes(job(), found).cost).all()
 
 
 def test_what_is_made_is_kept_and_the_rest_is_made_again() -> None:

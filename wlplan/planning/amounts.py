@@ -112,6 +112,10 @@ class Amount(struct.PyTreeNode):
         del mass
         return True
 
+    def shortfall(self, mass: Float[Array, ""]) -> Float[Array, ""]:
+        """What a load [tonne] that is not worth it counts beside its cost, where loads compare."""
+        return jnp.zeros_like(mass)
+
     def is_done(self, done: Done) -> Bool[Array, ""]:
         """Whether no further load is wanted; by default a plan ends with its rows."""
         del done
@@ -212,8 +216,11 @@ class Tonnes(Amount):
 
     def rest(self, done: Done) -> Float[Array, ""]:
         """Of a part: what is done too little or too much is done more or less in the next."""
+        return self._rest(done, self.follows)
+
+    def _rest(self, done: Done, follows: Bool[Array, ""] | bool) -> Float[Array, ""]:
         next_part = self.price * (self.mass - done.mass)
-        return jnp.where(self.follows, next_part, MISFIT_COST * self.missing(done))
+        return jnp.where(follows, next_part, MISFIT_COST * self.missing(done))
 
     def to_go(self, done: Done, outlook: Outlook) -> Float[Array, ""]:
         """By the tonne, and at the end by the bucket: the last is made whatever it holds."""
@@ -254,6 +261,23 @@ class Emptying(Tonnes):
     def is_worth(self, mass: float) -> bool:
         """Whether it is more than the least."""
         return mass >= float(self.least)
+
+    def shortfall(self, mass: Float[Array, ""]) -> Float[Array, ""]:
+        """Of what it lacks of the least.
+
+        By the price of a tonne alone the end of a pile would be a load of next to nothing, which
+        is not made, with loads that are worth it beside it.
+        """
+        return MISFIT_COST * jnp.maximum(self.least - mass, 0.0)
+
+    def rest(self, done: Done) -> Float[Array, ""]:
+        """As of `Tonnes`, but nothing follows a plan that ends early: no load was worth it.
+
+        By the price of a tonne alone such a plan would be better than one that goes on, since the
+        last tonnes are the dearest.
+        """
+        to_the_end = (done.mass >= self.mass) | (done.loads >= _ROWS)
+        return self._rest(done, self.follows & to_the_end)
 
 
 @no_type_check

@@ -79,7 +79,7 @@ def score_of(
 ) -> Float[Array, ""]:
     """The same of a loading whose cost and mass [tonne] are known."""
     after = job.amount.step(standing.done, mass, jnp.zeros((), bool)).done
-    return cost + job.amount.to_go(after, outlook)
+    return cost + job.amount.shortfall(mass) + job.amount.to_go(after, outlook)
 
 
 class Advanced(NamedTuple):

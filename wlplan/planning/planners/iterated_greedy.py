@@ -11,7 +11,7 @@ import numpy as np
 from wlplan.planning.job import Job
 from wlplan.planning.planners.greedy import Greedy, Grown, cost_by_thorough_ways, plan_of
 from wlplan.planning.population import Pool
-from wlplan.planning.proposals import Progress, Proposals
+from wlplan.planning.proposals import NothingWorthIt, Progress, Proposals
 from wlplan.planning.watch import watching
 
 _GREEDY = Greedy()
@@ -62,7 +62,13 @@ class IteratedGreedy:
             if number >= self.starts:
                 parent = best[random.integers(len(best))][1]
                 kept = parent[: random.integers(len(parent))]
-            made = self.greedy.grow(job, kept, loads, random, watch, says=not best)
+            try:
+                made = self.greedy.grow(job, kept, loads, random, watch, says=not best)
+            except NothingWorthIt:
+                # With other trials there may be something.
+                if best or number + 1 < self.starts:
+                    continue
+                raise
             # What greedy makes of the ways is too rough to choose by.
             watch.spend(way=len(made))
             cost = cost_by_thorough_ways(job, made, loads)
