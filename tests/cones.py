@@ -30,6 +30,15 @@ def wide_cone() -> Pile:
     )
 
 
+def on_map(*cones: tuple[tuple[float, float], float]) -> Pile:
+    """Cones of 30 degrees on one map of 26 x 16 m: middle and radius [m] of each."""
+    x, y = np.meshgrid(0.1 * np.arange(260), 0.1 * np.arange(160), indexing="ij")
+    height = np.zeros_like(x)
+    for (cx, cy), radius in cones:
+        height = np.maximum(height, 0.577 * (radius - np.hypot(x - cx, y - cy)))
+    return Pile(jnp.asarray(height, jnp.float32), 0.1)
+
+
 def circle(radius: float = 4.7, n: int = 290) -> ToeContour:
     """The toe of the cone where it rises by TOE_RISE."""
     angle = 2 * np.pi * np.arange(n) / n

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cones import SITE, bowl_world, cone
+from cones import SITE, bowl_world, cone, on_map
 
 import wlplan
 from wlplan.errors import InputError
@@ -30,8 +30,12 @@ from wlplan.planning.amounts import (
 )
 from wlplan.planning.plan import plan_loads, play
 from wlplan.planning.planners import Gradient, Greedy, Nominal
+from wlplan.site.receiver import Receiver
+from wlplan.site.site import Site
+from wlplan.terrain.toes import toes_of
 from wlplan.types import Action, Performance, Pile, Pose
 
+AWAY = Site(receiver=Receiver(jnp.float32(14.0), jnp.float32(-6.0), jnp.float32(0.5 * math.pi)))
 GREEDY = Greedy(actions=8, refine_steps=30, refined=4, poses_per_metre=0.5)
 
 
@@ -247,6 +251,42 @@ def test_a_pile_is_emptied_of_all_that_is_worth_a_load() -> None:
     assert masses.min() >= 0.8
     left = float(wlplan_volume(result.rollout.pile)) / float(wlplan_volume(pile))
     assert left <= 0.3 + 1e-3
+
+
+def barren_world(pile: Pile, pose: Pose, action: Action) -> tuple[Pile, Performance]:
+    """After the first load there is next to nothing west of x = 14 m; a corner remembers it."""
+    is_barren = (pose.x < 14.0) & (pile.height[0, 0] > 0.0)
+    after, performance = bowl_world(pile, pose, action)
+    mass = jnp.where(is_barren, 0.1, performance.mass)
+    return after.replace(height=after.height.at[0, 0].set(0.01)), performance.replace(mass=mass)
+
+
+def test_where_one_heap_gives_no_more_the_next_is_emptied() -> None:
+    large, small = (7.0, 8.0), (20.0, 8.0)
+    pile = on_map((large, 5.0), (small, 3.0))
+    planner = Greedy(actions=8, refine_steps=0, refined=4, poses_per_metre=0.5)
+    result = plan_loads(barren_world, pile, amount=Empty(0.9), planner=planner, site=AWAY)
+    masses, x = np.asarray(result.rollout.performance.mass), np.asarray(result.plan.pose.x)
+    assert x[0] < 14.0
+    assert (x[1:] > 14.0).all()
+    assert masses.min() >= 0.8
+    assert float(result.missing) == 0.0
+    # Loads that only have to be counted are made of the largest pile alone.
+    result = plan_loads(barren_world, pile, loads=2, planner=planner, site=AWAY)
+    assert (np.asarray(result.plan.pose.x) < 14.0).all()
+
+
+@pytest.mark.parametrize(("least", "count"), [(1.2, 2), (1.3, 1)])
+def test_a_ridge_that_holds_a_load_is_a_heap(least: float, count: int) -> None:
+    pile = on_map(((7.0, 8.0), 5.0))
+    # 0.72 m^3, 1.24 t: less than what counts as a pile elsewhere.
+    pile = pile.replace(height=pile.height.at[190:230, 77:83].set(0.3))
+    emptying = Empty(0.02, least=least).of(pile, SITE.soil)
+    smallest = emptying.smallest_heap()
+    assert smallest is not None
+    assert len(toes_of(pile, smallest=smallest)) == count
+    assert len(toes_of(pile)) == 1
+    assert Tonnes(9.0).smallest_heap() is None
 
 
 def wlplan_volume(pile: Pile) -> float:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cones import on_map
 
 import wlplan
 from wlplan.errors import InputError
@@ -11,15 +12,6 @@ from wlplan.terrain.toes import poses_around, toes_of
 from wlplan.types import Action, Performance, Pile, Pose
 
 LARGE, SMALL, HEAP = (7.0, 8.0), (20.0, 8.0), (14.0, 1.5)
-
-
-def on_map(*cones: tuple[tuple[float, float], float]) -> Pile:
-    """Cones of 30 degrees on one map of 26 x 16 m: middle and radius [m] of each."""
-    x, y = np.meshgrid(0.1 * np.arange(260), 0.1 * np.arange(160), indexing="ij")
-    height = np.zeros_like(x)
-    for (cx, cy), radius in cones:
-        height = np.maximum(height, 0.577 * (radius - np.hypot(x - cx, y - cy)))
-    return Pile(height.astype(np.float32), 0.1)
 
 
 def test_each_pile_has_its_toe_the_largest_first() -> None:

@@ -112,6 +112,10 @@ class Amount(struct.PyTreeNode):
         del mass
         return True
 
+    def smallest_heap(self) -> float | None:
+        """Volume from which each heap that is left is dug [m^3]; None: the largest alone is."""
+        return None
+
     def shortfall(self, mass: Float[Array, ""]) -> Float[Array, ""]:
         """What a load [tonne] that is not worth it counts beside its cost, where loads compare."""
         return jnp.zeros_like(mass)
@@ -244,7 +248,11 @@ class Empty(Amount):
         """The mass by the volume of the pile."""
         above = np.maximum(np.asarray(pile.height - pile.floor, np.float64), 0.0)
         mass = float(above.sum()) * pile.cell_size**2 * soil.density / KG_PER_TONNE
-        return Emptying(mass=(1.0 - float(self.remaining)) * mass, least=float(self.least))
+        return Emptying(
+            mass=(1.0 - float(self.remaining)) * mass,
+            least=float(self.least),
+            density=soil.density / KG_PER_TONNE,
+        )
 
 
 @no_type_check
@@ -252,6 +260,7 @@ class Emptying(Tonnes):
     """`Empty` of a pile that is known."""
 
     least: float | Array = 0.8
+    density: float | Array = 1.0  # of the soil [tonne/m^3]
 
     def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
         """A dozen loads, counted by the tonne: the end is where loads are not worth it."""
@@ -261,6 +270,10 @@ class Emptying(Tonnes):
     def is_worth(self, mass: float) -> bool:
         """Whether it is more than the least."""
         return mass >= float(self.least)
+
+    def smallest_heap(self) -> float:
+        """That of the least load."""
+        return float(self.least) / float(self.density)
 
     def shortfall(self, mass: Float[Array, ""]) -> Float[Array, ""]:
         """Of what it lacks of the least.

@@ -44,6 +44,7 @@ from wlplan.planning.watch import Watch
 from wlplan.site.receiver import Receiver, receiver_count
 from wlplan.site.site import Site
 from wlplan.terrain.toe import ToeContour
+from wlplan.terrain.toes import toes_of
 from wlplan.types import LoadingPlan, Pile, World
 from wlplan.worlds.capabilities import as_pytree, is_differentiable
 
@@ -138,12 +139,14 @@ def plan_loads(
         )
     next_part = amount.next_truck if each and isinstance(amount, Trucks) else amount.part
     receivers: list[Receiver] = []
+    # Heaps that nothing is worth it of, the largest first.
+    past = 0
     while not watch.stopped and (part := next_part(made, typical)) is not None:
         of_part, rows = job.replace(amount=part[0]), part[1]
         proposals = None
         try:
             with watch.ending():
-                of_part = with_toe(of_part, None if parts else contour)
+                of_part = with_toe(of_part, _next_heap(of_part, past) if parts else contour)
                 if not parts:
                     judge = () if checked is None else (checked,)
                     compile_ahead(of_part, (*judge, job.world))
@@ -159,11 +162,14 @@ def plan_loads(
                 if getattr(chosen, "plays_in_referee", False):
                     asked = of_part.replace(referee=checked)
                 proposals = chosen.propose(asked, rows, seed=seed + len(parts), progress=watch)
-        except (InputError, NothingWorthIt):
+        except (InputError, NothingWorthIt) as error:
             # Of what was planned already, nothing is lost.
             if not parts:
                 raise
-            break
+            if isinstance(error, InputError) or part[0].smallest_heap() is None:
+                break
+            past += 1
+            continue
         if proposals is None and watch.best is not None:
             watch("best so far", 0, 1, None)
             proposals = Proposals(watch.best.plan)
@@ -172,6 +178,7 @@ def plan_loads(
         result = choose(of_part, proposals, referee=checked, mend=mend)
         if not len(result.costs):
             break
+        past = 0
         parts.append(result)
         receivers.append(of_part.site.placed_receiver)
         # What is planned next is planned on the pile as the referee has it by then, and for what is
@@ -187,6 +194,21 @@ def plan_loads(
     if each:
         receiver = jax.tree.map(lambda *leaves: jnp.stack(leaves), *receivers)
     return joined(parts).replace(receiver=receiver, spent=watch.spent, stopped=watch.stopped)
+
+
+def _next_heap(job: Job, past: int) -> ToeContour | None:
+    """The toe of the largest heap but those that were given up; None: that of the largest of all.
+
+    Raises:
+        InputError: If no further one is left.
+    """
+    smallest = job.amount.smallest_heap()
+    if smallest is None:
+        return None
+    heaps = toes_of(job.pile, machine=job.site.machine, smallest=smallest)
+    if past >= len(heaps):
+        raise InputError("Nothing to dig: no heap is left that is worth it.")
+    return heaps[past].contour
 
 
 def _price(parts: Sequence[PlanResult]) -> float:

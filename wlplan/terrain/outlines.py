@@ -25,6 +25,7 @@ def largest_outline(
     origin: Float[np.ndarray, "2"],
     cell: float,
     width: float,
+    smallest: float = SMALLEST_VOLUME,
 ) -> Complex[np.ndarray, " _"]:
     """The longest line, inside the map, around the largest pile by volume, without its hollows.
 
@@ -34,6 +35,7 @@ def largest_outline(
         origin: World position of the first cell [m].
         cell: Grid spacing [m].
         width: Of the bucket [m]: a pile that is narrower in every direction does not count.
+        smallest: Volume of the smallest pile that does [m^3].
 
     Returns:
         Points of the line; one that does not run over the edge of the map ends where it begins.
@@ -53,9 +55,10 @@ def largest_outline(
         )
     x, y = (origin[k] + cell * np.arange(part[k].start, part[k].stop) for k in (0, 1))
     lines = _level_lines(near, x, y, rise)
-    if not _is_one_pile(lines, near, higher, cell, width):
+    if not _is_one_pile(lines, near, higher, cell, width, smallest):
         # Most piles are one, and to see that takes less time than to look for the largest.
-        lines = _level_lines(_largest_alone(near, higher, rise, cell, width), x, y, rise)
+        alone = _largest_alone(near, higher, rise, cell, width, smallest)
+        lines = _level_lines(alone, x, y, rise)
     if not lines:
         raise InputError(
             "The pile covers the whole map, so its toe is not on it: scan a wider area, down to "
@@ -111,6 +114,7 @@ def _is_one_pile(
     higher: Bool[np.ndarray, "n m"],
     cell: float,
     width: float,
+    smallest: float,
 ) -> bool:
     """Whether level lines are for certain the edge of a single pile that is worth digging."""
     if len(lines) != 1 or lines[0][0] != lines[0][-1] or higher[0, 0]:
@@ -120,7 +124,7 @@ def _is_one_pile(
     if (one[:, :-1] & one[:, 1:] & other[:-1] & other[1:]).any():
         return False
     size = cell * (max(higher.shape) - 2)
-    return size >= width and bool(above[higher].sum() * cell**2 >= SMALLEST_VOLUME)
+    return size >= width and bool(above[higher].sum() * cell**2 >= smallest)
 
 
 def _largest_alone(
@@ -129,6 +133,7 @@ def _largest_alone(
     rise: float,
     cell: float,
     width: float,
+    smallest: float,
 ) -> Float[np.ndarray, "n m"]:
     """The surface with all piles but the largest sunk, and its hollows filled, to about the level.
 
@@ -141,10 +146,10 @@ def _largest_alone(
     extent = cell * max(side.stop - side.start - 2 for side in _bounds(largest))
     if extent < width:
         extent = _largest_extent(np.argwhere(largest) * cell) + cell
-    if volumes.max() < SMALLEST_VOLUME or extent < width:
+    if volumes.max() < smallest or extent < width:
         raise InputError(
             f"Nothing to dig: the largest pile holds {volumes.max():.2g} m^3 and is {extent:.2g} m "
-            f"long; a bucket needs {SMALLEST_VOLUME:g} m^3 and {width:g} m."
+            f"long; a bucket needs {smallest:.2g} m^3 and {width:g} m."
         )
     # What is outside is in one piece, unless there are hollows or the pile runs over the edge.
     solid = largest if ndimage.label(~largest)[1] == 1 else ndimage.binary_fill_holes(largest)

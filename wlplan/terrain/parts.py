@@ -38,6 +38,7 @@ def find_parts(
     origin: Float[np.ndarray, "2"],
     *,
     rise: float,
+    smallest: float = SMALLEST_VOLUME,
 ) -> tuple[Int[np.ndarray, "nx ny"], tuple[Part, ...]]:
     """The piles of a map, largest first, and the label of each cell; 0 is none of them.
 
@@ -46,6 +47,7 @@ def find_parts(
         cell_size: Grid spacing [m].
         origin: x and y of the first cell [m].
         rise: Height above the ground that counts as pile [m].
+        smallest: Volume from which one counts [m^3].
     """
     labels, count = ndimage.label(above > rise)
     numbers = np.arange(1, count + 1)
@@ -53,7 +55,7 @@ def find_parts(
     volumes = np.bincount(flat, weights=height, minlength=count + 1)[1:] * cell_size**2
     areas = np.bincount(flat, minlength=count + 1)[1:] * cell_size**2
     found = []
-    for number in numbers[volumes >= SMALLEST_VOLUME]:
+    for number in numbers[volumes >= smallest]:
         i, j = np.nonzero(labels == number)
         mass = above[i, j]
         x, y = (

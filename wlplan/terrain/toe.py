@@ -12,7 +12,7 @@ from scipy import ndimage
 from wlplan.checks import check_pile
 from wlplan.errors import InputError
 from wlplan.site.machine import WA320, WheelLoader
-from wlplan.terrain.outlines import distances_along, largest_outline
+from wlplan.terrain.outlines import SMALLEST_VOLUME, distances_along, largest_outline
 from wlplan.terrain.standing import standing
 from wlplan.types import Pile, Pose
 
@@ -36,7 +36,13 @@ class ToeContour:
     accessible: Bool[np.ndarray, " n"]  # a bucket can start here on ground that the scan saw
 
 
-def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA320) -> ToeContour:
+def toe_contour(
+    pile: Pile,
+    *,
+    rise: float = TOE_RISE,
+    machine: WheelLoader = WA320,
+    smallest: float = SMALLEST_VOLUME,
+) -> ToeContour:
     """Trace the toe of the largest pile, by volume, on the grid.
 
     The toe is where the surface stands `rise` above the ground. Hollows inside the pile are not
@@ -51,9 +57,10 @@ def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA
         pile: One pile, not a batch.
         rise: Height above the ground that counts as pile [m].
         machine: What digs: a bucket has to fit, and to find pile over the length of its floor.
+        smallest: Volume from which a pile counts [m^3].
 
     Raises:
-        InputError: If there is nothing to dig: no cell higher than `rise`, less than 1 m^3, or a
+        InputError: If there is nothing to dig: no cell higher than `rise`, less volume, or a
             footprint narrower than the bucket in every direction.
     """
     if not 0.0 < rise < math.inf:
@@ -66,7 +73,10 @@ def toe_contour(pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA
     if ground is not None:
         above = above - ground
     origin = np.asarray(pile.origin, np.float64)
-    line = largest_outline(above, rise=rise, origin=origin, cell=cell, width=machine.bucket_width)
+    width = machine.bucket_width
+    line = largest_outline(
+        above, rise=rise, origin=origin, cell=cell, width=width, smallest=smallest
+    )
     closed = bool(line[0] == line[-1]) and len(line) > 2
 
     marks = distances_along(line)

@@ -11,6 +11,7 @@ from jaxtyping import Int
 from wlplan.checks import check_pile
 from wlplan.errors import InputError
 from wlplan.site.machine import WA320, WheelLoader
+from wlplan.terrain.outlines import SMALLEST_VOLUME
 from wlplan.terrain.parts import Part, find_parts
 from wlplan.terrain.toe import TOE_RISE, ToeContour, edge_poses, toe_contour
 from wlplan.types import Pile, Pose
@@ -26,7 +27,11 @@ class PileToe:
 
 
 def toes_of(
-    pile: Pile, *, rise: float = TOE_RISE, machine: WheelLoader = WA320
+    pile: Pile,
+    *,
+    rise: float = TOE_RISE,
+    machine: WheelLoader = WA320,
+    smallest: float = SMALLEST_VOLUME,
 ) -> tuple[PileToe, ...]:
     """The toes of all piles of a map that a bucket can dig, the largest pile first.
 
@@ -36,6 +41,7 @@ def toes_of(
         pile: The map, not a batch.
         rise: As of `toe_contour`.
         machine: Likewise.
+        smallest: Likewise.
 
     Raises:
         InputError: As `toe_contour`, if there is none.
@@ -43,7 +49,7 @@ def toes_of(
     check_pile(pile)
     height, floor = (np.asarray(leaf, np.float64) for leaf in (pile.height, pile.floor))
     origin = np.asarray(pile.origin, np.float64)
-    labels, parts = find_parts(height - floor, pile.cell_size, origin, rise=rise)
+    labels, parts = find_parts(height - floor, pile.cell_size, origin, rise=rise, smallest=smallest)
     found = []
     for part in parts:
         others = np.isin(labels, [other.number for other in parts if other is not part])
@@ -51,7 +57,7 @@ def toes_of(
         # Where there are no others, it is the pile itself.
         alone = pile.replace(ground=on_device(ground)) if others.any() else pile
         try:
-            contour = toe_contour(alone, rise=rise, machine=machine)
+            contour = toe_contour(alone, rise=rise, machine=machine, smallest=smallest)
         except InputError:
             # Too narrow for the bucket: nothing to dig, where there are others.
             if len(parts) == 1:
@@ -61,7 +67,7 @@ def toes_of(
             found.append(PileToe(part, contour))
     if not found:
         # Says why.
-        largest = toe_contour(pile, rise=rise, machine=machine)
+        largest = toe_contour(pile, rise=rise, machine=machine, smallest=smallest)
         edge_poses(largest, 1)
     return tuple(found)
 
