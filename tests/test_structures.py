@@ -247,7 +247,9 @@ def test_the_pile_that_is_meant(tmp_path: Path) -> None:
     both, western = read_scan(path), read_scan(path, pile=(8.0, 12.0))
     (note,) = [note for note in both.notes if "2 piles" in note]
     assert "(planned), " in note
-    assert "--pile X,Y" in note
+    assert "--pile X,Y, else long jobs go on to the next" in note
+    (note,) = [note for note in western.contents.notes if "2 piles" in note]
+    assert note.endswith("--pile X,Y")
     assert western.contents.planned is not None
     assert western.contents.planned.x == pytest.approx(7.0, abs=0.1)
     assert float(volume(western.pile)) == pytest.approx(both.contents.piles[1].volume, rel=0.02)

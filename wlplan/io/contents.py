@@ -133,7 +133,8 @@ def contents_of(
                 f"there is no pile at {pile[0]:g}, {pile[1]:g}: {_piles(parts, None, frame)}."
             )
     if len(parts) > 1:
-        notes.append(f"{_piles(parts, planned, frame)}; choose with --pile X,Y")
+        further = "" if pile is not None else ", else long jobs go on to the next largest"
+        notes.append(f"{_piles(parts, planned, frame)}; choose with --pile X,Y{further}")
     if pile is not None:
         others = np.isin(of_piles, [part.number for part in parts if part is not planned])
         ground = np.where(others, height, ground)
