@@ -28,7 +28,8 @@ from wlplan.planning.amounts import (
     check_amount,
     nothing_done,
 )
-from wlplan.planning.plan import plan_loads, play
+from wlplan.planning.job import make_job
+from wlplan.planning.plan import _next_heap, plan_loads, play
 from wlplan.planning.planners import Gradient, Greedy, Nominal
 from wlplan.site.receiver import Receiver
 from wlplan.site.site import Site
@@ -282,11 +283,14 @@ def test_a_ridge_that_holds_a_load_is_a_heap(least: float, count: int) -> None:
     # 0.72 m^3, 1.24 t: less than what counts as a pile elsewhere.
     pile = pile.replace(height=pile.height.at[190:230, 77:83].set(0.3))
     emptying = Empty(0.02, least=least).of(pile, SITE.soil)
-    smallest = emptying.smallest_heap()
-    assert smallest is not None
-    assert len(toes_of(pile, smallest=smallest)) == count
+    job = make_job(bowl_world, pile, site=SITE, objective="delivery", amount=emptying)
+    for past in range(count):
+        assert _next_heap(job, past) is not None
+    with pytest.raises(InputError, match="no heap is left"):
+        _next_heap(job, count)
     assert len(toes_of(pile)) == 1
-    assert Tonnes(9.0).smallest_heap() is None
+    # Of other amounts the largest alone is dug.
+    assert _next_heap(job.replace(amount=Tonnes(9.0)), 0) is None
 
 
 def wlplan_volume(pile: Pile) -> float:

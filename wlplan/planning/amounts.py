@@ -107,18 +107,20 @@ class Amount(struct.PyTreeNode):
         del typical
         return None if made.loads else (self, _ROWS)
 
-    def is_worth(self, mass: float) -> bool:
-        """Whether a load [tonne] is made at all."""
-        del mass
-        return True
+    def least_load(self) -> float | Array:
+        """Least load that is made [tonne].
 
-    def smallest_heap(self) -> float | None:
-        """Volume from which each heap that is left is dug [m^3]; None: the largest alone is."""
-        return None
+        If it is above 0, each heap that holds so much is dug, and not the largest alone.
+        """
+        return 0.0
 
     def shortfall(self, mass: Float[Array, ""]) -> Float[Array, ""]:
-        """What a load [tonne] that is not worth it counts beside its cost, where loads compare."""
-        return jnp.zeros_like(mass)
+        """What a load [tonne] counts beside its cost, where loads compare, for being too small.
+
+        By the price of a tonne alone the end of a pile would be a load of next to nothing, which
+        is not made, with loads that are worth it beside it.
+        """
+        return MISFIT_COST * jnp.maximum(self.least_load() - mass, 0.0)
 
     def is_done(self, done: Done) -> Bool[Array, ""]:
         """Whether no further load is wanted; by default a plan ends with its rows."""
@@ -248,11 +250,7 @@ class Empty(Amount):
         """The mass by the volume of the pile."""
         above = np.maximum(np.asarray(pile.height - pile.floor, np.float64), 0.0)
         mass = float(above.sum()) * pile.cell_size**2 * soil.density / KG_PER_TONNE
-        return Emptying(
-            mass=(1.0 - float(self.remaining)) * mass,
-            least=float(self.least),
-            density=soil.density / KG_PER_TONNE,
-        )
+        return Emptying(mass=(1.0 - float(self.remaining)) * mass, least=float(self.least))
 
 
 @no_type_check
@@ -260,28 +258,15 @@ class Emptying(Tonnes):
     """`Empty` of a pile that is known."""
 
     least: float | Array = 0.8
-    density: float | Array = 1.0  # of the soil [tonne/m^3]
 
     def part(self, made: Made, typical: float) -> tuple[Amount, int] | None:
         """A dozen loads, counted by the tonne: the end is where loads are not worth it."""
         found = super().part(made, typical)
         return found and (found[0].replace(follows=True), found[1])
 
-    def is_worth(self, mass: float) -> bool:
-        """Whether it is more than the least."""
-        return mass >= float(self.least)
-
-    def smallest_heap(self) -> float:
-        """That of the least load."""
-        return float(self.least) / float(self.density)
-
-    def shortfall(self, mass: Float[Array, ""]) -> Float[Array, ""]:
-        """Of what it lacks of the least.
-
-        By the price of a tonne alone the end of a pile would be a load of next to nothing, which
-        is not made, with loads that are worth it beside it.
-        """
-        return MISFIT_COST * jnp.maximum(self.least - mass, 0.0)
+    def least_load(self) -> float | Array:
+        """As of `Empty`."""
+        return self.least
 
     def rest(self, done: Done) -> Float[Array, ""]:
         """As of `Tonnes`, but nothing follows a plan that ends early: no load was worth it.

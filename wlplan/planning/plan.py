@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from wlplan.checks import check_plan
-from wlplan.constants import DEFAULT_LOADS
+from wlplan.constants import DEFAULT_LOADS, KG_PER_TONNE
 from wlplan.errors import InputError
 from wlplan.planning import planners
 from wlplan.planning.amounts import Amount, Loads, Made, Tonnes, Trucks, typical_load
@@ -166,7 +166,7 @@ def plan_loads(
             # Of what was planned already, nothing is lost.
             if not parts:
                 raise
-            if isinstance(error, InputError) or part[0].smallest_heap() is None:
+            if isinstance(error, InputError) or not part[0].least_load():
                 break
             past += 1
             continue
@@ -202,9 +202,10 @@ def _next_heap(job: Job, past: int) -> ToeContour | None:
     Raises:
         InputError: If no further one is left.
     """
-    smallest = job.amount.smallest_heap()
-    if smallest is None:
+    least = float(job.amount.least_load())
+    if not least:
         return None
+    smallest = least * KG_PER_TONNE / job.site.soil.density
     heaps = toes_of(job.pile, machine=job.site.machine, smallest=smallest)
     if past >= len(heaps):
         raise InputError("Nothing to dig: no heap is left that is worth it.")
