@@ -53,7 +53,9 @@ class ConvolutionalEncoder(nnx.Module):
         x = jnp.moveaxis(resize(maps, _CELLS).reshape(-1, _CELLS, _CELLS), 0, -1)[None]
         for filters, norm in zip(self.filters, self.norms, strict=True):
             near = patches(x)
-            x = filters(near.reshape(len(near), -1).T).T
+            # Not `filters(near.T).T`: the copies that XLA makes for it take as long as all else.
+            flat = near.reshape(len(near), -1)
+            x = filters.kernel[...].T @ flat + filters.bias[...][:, None]
             x = norm(x, use_running_average=not training).reshape(_FILTERS, *near.shape[1:])
             x = max_pool(activation_named(self.activation)(x))
         return self.output(x.reshape(-1, x.shape[-1]).T).reshape(*batch, _CODE)
