@@ -7,10 +7,12 @@ one ended.
 from __future__ import annotations
 
 import argparse
+import ctypes
 import functools
 import hashlib
 import json
 import shutil
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -78,6 +80,22 @@ def made_with(settings: PerformanceSettings, data: Dataset) -> dict[str, Any]:
         data: Data set to train on.
     """
     return {"settings": settings.as_dict(), "recipe": recipe(data), "versions": versions()}
+
+
+# Options of `mallopt` of the C library of GNU.
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+
+
+def keep_memory() -> None:
+    """Has the process keep memory that is freed, where the C library can be told.
+
+    A step of the paper's ψ_high needs 60 MB that the one before it gave back: without this it
+    takes 41 ms instead of 22 to have its pages made anew (one core of an Intel Xeon).
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(_M_MMAP_MAX, 0)
+        mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
 def train_row(settings: PerformanceSettings, data: Dataset, place: Path) -> dict[str, Any]:
@@ -172,6 +190,7 @@ def main(
             rows.lay(json.loads(committed.read_text()))
         every = trainings(options.preset)
         if not options.join:
+            keep_memory()
             todo = [one for one in every if options.whole or smoke or first(one)]
             mine = part_of(matching(todo, options.only), options.shard)
             _make(mine, rows, data, time_is_up(options))

@@ -54,6 +54,7 @@ class ConvolutionalEncoder(nnx.Module):
         for filters, norm in zip(self.filters, self.norms, strict=True):
             near = patches(x)
             # Not `filters(near.T).T`: the copies that XLA makes for it take as long as all else.
+            assert filters.bias is not None
             flat = near.reshape(len(near), -1)
             x = filters.kernel[...].T @ flat + filters.bias[...][:, None]
             x = norm(x, use_running_average=not training).reshape(_FILTERS, *near.shape[1:])
