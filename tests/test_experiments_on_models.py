@@ -2,6 +2,9 @@
 
 import dataclasses
 import itertools
+import platform
+import subprocess
+import sys
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -26,6 +29,8 @@ from wlplan.constants import CELL_SIZE
 from wlplan.dataset import fingerprint
 from wlplan.training import PsiHighSettings, PsiLowSettings, Settings
 from wlplan.types import Action, Performance, Pile, Pose
+
+ROOT = Path(__file__).parents[1]
 
 # --- models that are kept
 
@@ -197,6 +202,33 @@ def test_a_row_serves_the_same_cycles_of_another_processor_and_no_others() -> No
         assert training_rows.made_with(PsiLowSettings(), other) != made
     fewer = synthetic(rollouts=2, loads=2)
     assert training_rows.made_with(PsiLowSettings(), fewer) != made
+
+
+FREED_AGAIN_AND_AGAIN = """
+import resource, sys
+from experiments._common.training_rows import keep_memory
+if sys.argv[1] == "kept":
+    keep_memory()
+def pages():
+    b"x" * 40_000_000
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+first = pages()
+for _ in range(20):
+    last = pages()
+print(last - first)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc is told")
+def test_memory_that_is_kept_is_not_made_anew() -> None:
+    pages = {}
+    for case in ("kept", "given back"):
+        command = [sys.executable, "-c", FREED_AGAIN_AND_AGAIN, case]
+        done = subprocess.run(command, check=True, capture_output=True, cwd=ROOT, text=True)
+        pages[case] = int(done.stdout)
+    # The pages may be of 2 MB.
+    assert pages["given back"] >= 20 * 19
+    assert pages["kept"] < 20
 
 
 # --- noise floor
