@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -131,6 +132,7 @@ def test_of_loads_that_empty_a_pile_none_is_better_that_would_not_be_made() -> N
     # Of those that are made the price decides.
     assert score(0.6, 0.8) > score(0.9, 1.5)
     assert float(Tonnes(100.0).shortfall(jnp.float32(0.1))) == 0.0
+    assert float(jax.grad(Tonnes(100.0).shortfall)(jnp.float32(0.0))) == 0.0
 
 
 def test_of_a_pile_that_is_emptied_nothing_follows_where_no_load_was_worth_it() -> None:

@@ -10,6 +10,7 @@ import dataclasses
 import math
 from typing import Any, ClassVar, NamedTuple, no_type_check
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -120,7 +121,8 @@ class Amount(struct.PyTreeNode):
         By the price of a tonne alone the end of a pile would be a load of next to nothing, which
         is not made, with loads that are worth it beside it.
         """
-        return MISFIT_COST * jnp.maximum(self.least_load() - mass, 0.0)
+        # Without a slope at 0, where an empty load lies if there is no least.
+        return MISFIT_COST * jax.nn.relu(self.least_load() - mass)
 
     def is_done(self, done: Done) -> Bool[Array, ""]:
         """Whether no further load is wanted; by default a plan ends with its rows."""
