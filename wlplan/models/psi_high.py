@@ -53,9 +53,9 @@ class ConvolutionalEncoder(nnx.Module):
         x = jnp.moveaxis(resize(maps, _CELLS).reshape(-1, _CELLS, _CELLS), 0, -1)[None]
         for filters, norm in zip(self.filters, self.norms, strict=True):
             near = patches(x)
-            # Not `filters(near.T).T`: the copies that XLA makes for it take as long as all else.
-            assert filters.bias is not None
             flat = near.reshape(len(near), -1)
+            assert filters.bias is not None
+            # Not `filters(flat.T).T`: the copies that XLA makes for it take as long as all else.
             x = filters.kernel[...].T @ flat + filters.bias[...][:, None]
             x = norm(x, use_running_average=not training).reshape(_FILTERS, *near.shape[1:])
             x = max_pool(activation_named(self.activation)(x))

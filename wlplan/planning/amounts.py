@@ -10,7 +10,6 @@ import dataclasses
 import math
 from typing import Any, ClassVar, NamedTuple, no_type_check
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -116,13 +115,8 @@ class Amount(struct.PyTreeNode):
         return 0.0
 
     def shortfall(self, mass: Float[Array, ""]) -> Float[Array, ""]:
-        """What a load [tonne] counts beside its cost, where loads compare, for being too small.
-
-        By the price of a tonne alone the end of a pile would be a load of next to nothing, which
-        is not made, with loads that are worth it beside it.
-        """
-        # Without a slope at 0, where an empty load lies if there is no least.
-        return MISFIT_COST * jax.nn.relu(self.least_load() - mass)
+        """What a load [tonne] below the least counts beside its cost, where loads compare."""
+        return jnp.zeros_like(mass)
 
     def is_done(self, done: Done) -> Bool[Array, ""]:
         """Whether no further load is wanted; by default a plan ends with its rows."""
@@ -269,6 +263,14 @@ class Emptying(Tonnes):
     def least_load(self) -> float | Array:
         """As of `Empty`."""
         return self.least
+
+    def shortfall(self, mass: Float[Array, ""]) -> Float[Array, ""]:
+        """Of what it lacks of the least.
+
+        By the price of a tonne alone the end of a pile would be a load of next to nothing, which
+        is not made, with loads that are worth it beside it.
+        """
+        return MISFIT_COST * jnp.maximum(self.least - mass, 0.0)
 
     def rest(self, done: Done) -> Float[Array, ""]:
         """As of `Tonnes`, but nothing follows a plan that ends early: no load was worth it.

@@ -125,7 +125,7 @@ class Greedy(LoadSearch):
                 played = LoadPlayed(dug, one.pile, one.performance)
             yields = played.pile, played.performance.mass
             after, truck, cost = _made(job.amount, standing, yields, outlook, score)
-            if job.amount.shortfall(after.done.mass - standing.done.mass) > 0.0:
+            if after.done.mass - standing.done.mass < job.amount.least_load():
                 break
             standing, decision = after, decision.replace(truck=truck)
             made.append(
