@@ -23,8 +23,9 @@ def tables(result: dict[str, Any]) -> str:
     parts = [
         "# Benchmark of planners",
         f"{result['runs']:,} of {result['runs_of_the_preset']:,} runs, "
-        f"{other} of them with settings that their planners had before (*); means over the seeds. "
-        "A budget is in times what greedy spends. A dash: not run.",
+        f"{other} of them with settings that their planners had before (*); means over the seeds, "
+        "of which not all rows have as many. A budget is in times what greedy spends. "
+        "A dash: not run.",
     ]
     for job in (SMOKE_JOB, *JOBS):
         of_job = [row for row in rows if row["job"] == job]
@@ -39,7 +40,7 @@ def tables(result: dict[str, Any]) -> str:
     parts += [
         "## Looking ahead",
         "The best planner that looks ahead beside greedy that has as much: less in the simulator "
-        "[%], mean over the piles and its interval of 95 %.",
+        "[%], in pairs of the same pile and seed; mean over the piles and its interval of 95 %.",
         _gains(result["looking_ahead"], rows, ("looks ahead", "beside"), ("planner", "base")),
         "## Step by step",
         "Beside greedy with the fixed truck, on piles that have all steps: less in the simulator "
@@ -55,7 +56,7 @@ def _table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
 
 
 def _by_pile(rows: Sequence[dict[str, Any]], cell: Any) -> str:
-    """One line a site, planner and budget, one column a pile, and the time of the search."""
+    """One line a site, planner and budget, one column a pile, then seeds and time of a search."""
     piles = [pile for pile in PILES if any(row["pile"] == pile for row in rows)]
     lines = []
     for site in SITES:
@@ -66,8 +67,14 @@ def _by_pile(rows: Sequence[dict[str, Any]], cell: Any) -> str:
             cells = [cell(of_pile) if of_pile else _NONE for of_pile in of_piles]
             search = statistics.median(float(row["seconds"]) for row in own)
             name = planner + _mark(own)
-            lines.append([site, name, str(budget), *cells, f"{search:.0f}"])
-    return _table(["truck", "planner", "budget", *piles, "search [s]"], lines)
+            lines.append([site, name, str(budget), *cells, _counts(of_piles), f"{search:.0f}"])
+    return _table(["truck", "planner", "budget", *piles, "seeds", "search [s]"], lines)
+
+
+def _counts(parts: Sequence[Sequence[dict[str, Any]]]) -> str:
+    """How many rows the parts have that have any, least and most."""
+    counts = sorted({len(part) for part in parts if part})
+    return "–".join(str(count) for count in counts[:: max(len(counts) - 1, 1)])
 
 
 def _mark(rows: Sequence[dict[str, Any]]) -> str:
@@ -113,9 +120,10 @@ def _gains(
             planners.append(gain[name] + _mark([row for row in rows if _case(row) == case]))
         measures = [_interval(gain[measure]) for measure in _MEASURES]
         place = [gain["job"], gain["site"], *planners, str(gain["budget"])]
-        lines.append([*place, str(gain["cost"]["piles"]), *measures])
-    head = ["job", "truck", *heads, "budget", "piles", "cost", "time a tonne", "work a tonne"]
-    return _table(head, lines)
+        counts = str(gain["cost"]["piles"]), str(gain["pairs"])
+        lines.append([*place, *counts, *measures])
+    sizes = ["budget", "piles", "pairs"]
+    return _table(["job", "truck", *heads, *sizes, "cost", "time a tonne", "work a tonne"], lines)
 
 
 def _case(row: dict[str, Any]) -> tuple[str, str, str, int]:
