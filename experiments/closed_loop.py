@@ -91,16 +91,16 @@ CONDITIONS = {
 """What is wrong, by name."""
 
 ONCE, REFEREED, TRACED = "once", "once, refereed", "once, toe traced anew"
-ANEW = "after every scan"
+ANEW, CAREFUL = "after every scan", "after every scan, careful"
 """How is planned. The referee knows the soil, and sets the poses on the piles that it foresees. A
 greedy plan keeps to the toe of the first pile; with the toe traced anew it is what planning after
-every scan comes to if the model is right."""
+every scan comes to if the model is right. Careful has the objective of that name."""
 
 PLACE, TOE = "to the place", "to the toe"
 """How the loader gets to a dig."""
 
 OPEN = ((ONCE, PLACE), (ONCE, TOE), (REFEREED, PLACE), (TRACED, TOE))
-WAYS = (*OPEN, (ANEW, PLACE), (ANEW, TOE))
+WAYS = (*OPEN, (ANEW, PLACE), (CAREFUL, PLACE), (ANEW, TOE))
 """Both, as they are played."""
 
 Told = Callable[[int, Pile], LoadingPlan]
@@ -164,6 +164,7 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
         "extent": setup.extent,
         "objective": OBJECTIVE,
         "differences": differences(found),
+        "careful": careful(found),
         "seconds_a_load": _seconds(found),
         "cumulative": _cumulative(found),
         "rows": [{key: row[key] for key in row if key not in per_load} for row in found],
@@ -198,8 +199,9 @@ class _Bench:
         # The same scans, trucks and luck, however it is planned.
         trucks = self._trucks(condition, np.random.default_rng(self._seed))
         random, timing = np.random.default_rng(self._seed), _Timing([], [])
-        if plan == ANEW:
-            told = self._after_every_scan(condition, trucks, random, timing)
+        if plan in (ANEW, CAREFUL):
+            goal = "careful" if plan == CAREFUL else OBJECTIVE
+            told = self._after_every_scan(condition, trucks, random, timing, goal)
         else:
             scan = condition.scanner.scan(self._pile, random)
             told = _from(self._plan(scan, condition.scanner, traced=plan == TRACED))
@@ -228,11 +230,12 @@ class _Bench:
         trucks: list[Receiver],
         random: np.random.Generator,
         timing: _Timing,
+        objective: str = OBJECTIVE,
     ) -> Told:
         planner = Replanner(
             self._hybrid,
             site=self._site,
-            objective=OBJECTIVE,
+            objective=objective,
             search=LoadSearch(**self._setup.search),
             extent=self._setup.extent,
             seed=self._seed,
@@ -366,13 +369,42 @@ def differences(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 # Where the place that is told is the toe, there is one row for both.
                 anew = by_name.get((name, condition, ANEW, drive), anew)
                 pairs.append((by_name[name, condition, plan, drive], anew))
-            one = {"condition": condition, "plan": plan, "drive": drive, "pairs": len(pairs)}
-            for measure, value in _MEASURES.items():
-                change = [100.0 * (value(anew) / value(once) - 1.0) for once, anew in pairs]
-                one[measure] = _interval(np.array(change))
-            one["cheaper"] = sum(anew["cost"] < once["cost"] for once, anew in pairs)
-            found.append(one)
+            found.append({"condition": condition, "plan": plan, "drive": drive, **_changes(pairs)})
     return found
+
+
+def careful(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The careful objective against the usual one, both planned after every scan; as above."""
+    by_name = {(r["pile"], r["condition"], r["plan"], r["drive"]): r for r in rows}
+    piles_of: dict[str, list[str]] = {}
+    for pile, condition, plan, _ in by_name:
+        if plan == CAREFUL:
+            piles_of.setdefault(condition, []).append(pile)
+    return [
+        {
+            "condition": condition,
+            **_changes(
+                [
+                    (
+                        by_name[name, condition, ANEW, PLACE],
+                        by_name[name, condition, CAREFUL, PLACE],
+                    )
+                    for name in names
+                ]
+            ),
+        }
+        for condition, names in piles_of.items()
+    ]
+
+
+def _changes(pairs: list[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
+    """What the second of each pair differs by from the first, in percent of that."""
+    one: dict[str, Any] = {"pairs": len(pairs)}
+    for measure, value in _MEASURES.items():
+        change = [100.0 * (value(second) / value(first) - 1.0) for first, second in pairs]
+        one[measure] = _interval(np.array(change))
+    one["cheaper"] = sum(second["cost"] < first["cost"] for first, second in pairs)
+    return one
 
 
 def _interval(values: Float[np.ndarray, " n"]) -> list[float | None]:
@@ -434,7 +466,7 @@ def draw(folder: Path) -> None:
             way = row["plan"], row["drive"]
             loads = np.arange(1, len(row["cost"]) + 1)
             colour = styles[way][0] if way in styles else INK
-            dash = "--" if way == (ANEW, TOE) else "-"
+            dash = {(ANEW, TOE): "--", (CAREFUL, PLACE): ":"}.get(way, "-")
             cost = np.array(row["cost"]) / loads
             right.plot(loads, cost, dash, color=colour, lw=1.3, label=", ".join(way))
     right.set_xlabel("loads", fontsize=8)

@@ -13,7 +13,8 @@ from wlplan.errors import InputError
 from wlplan.planning.loading import Loading, Transport
 from wlplan.planning.plan import play
 from wlplan.planning.planners import Greedy
-from wlplan.planning.risk import Deviation, ExpectedStall
+from wlplan.planning.risk import Deviation, ExpectedStall, MassDeviation
+from wlplan.planning.terms import InverseMass
 from wlplan.site.site import Site
 from wlplan.types import Action, LoadingPlan, Performance, Pile, Pose
 from wlplan.worlds.capabilities import as_pytree, can
@@ -69,13 +70,22 @@ def test_a_deviation_by_hand() -> None:
     assert float(Deviation()(loading(KNOWS, k_bk=3.0))) == pytest.approx(0.3 + 0.1, rel=1e-5)
 
 
-@pytest.mark.parametrize("term", [ExpectedStall(), Deviation()])
+def test_a_lighter_load_by_hand() -> None:
+    one = loading(KNOWS)
+    assert float(MassDeviation()(one)) == pytest.approx(4.29 * 0.1 / 9.0, rel=2e-3)
+    # It is the slope of M0 / M: so of a small deviation what the term of the mass differs by.
+    lighter = one.replace(performance=one.performance.replace(mass=one.performance.mass - 0.001))
+    slope = (float(InverseMass()(lighter)) - float(InverseMass()(one))) / 0.001
+    assert float(MassDeviation()(one)) == pytest.approx(0.1 * slope, rel=2e-3)
+
+
+@pytest.mark.parametrize("term", [ExpectedStall(), Deviation(), MassDeviation()])
 def test_where_nothing_is_known_or_open_it_counts_nothing(term: Any) -> None:
     for world in (None, outcome, PLAIN, wlplan.load_world("simulator")):
         assert float(term(loading(world))) == 0.0
 
 
-@pytest.mark.parametrize("name", ["stall", "deviation"])
+@pytest.mark.parametrize("name", ["stall", "deviation", "mass_deviation"])
 def test_the_gradients_are_those_of_finite_differences(name: str) -> None:
     goal = wlplan.Objective({name: 1.0})
     with jax.enable_x64(True):
@@ -97,6 +107,7 @@ def test_an_objective_says_what_its_terms_need() -> None:
     goal = wlplan.Objective({"mass": 2.0, "stall": 1.0, "deviation": 0.5})
     assert goal.needs == {"stall": "stall_probability", "deviation": "uncertainty"}
     assert not wlplan.Objective(wlplan.OBJECTIVES["efficiency"]).needs
+    assert wlplan.Objective(wlplan.OBJECTIVES["careful"]).needs == {"mass_deviation": "uncertainty"}
     bounded = wlplan.Objective({"sure": wlplan.Constraint(ExpectedStall())})
     assert bounded.needs == {"sure": "stall_probability"}
 
@@ -133,7 +144,7 @@ def pile() -> Pile:
     return wlplan.relax(wlplan.seed_pile("conical", slope=np.radians(30.0), height=2.0))
 
 
-@pytest.mark.parametrize("name", ["stall", "deviation"])
+@pytest.mark.parametrize("name", ["stall", "deviation", "mass_deviation"])
 def test_to_plan_for_what_the_world_does_not_know_is_refused(pile: Pile, name: str) -> None:
     goal = wlplan.Objective({"time": 1.0, name: 1.0})
     calls: list[Any] = [

@@ -10,6 +10,10 @@ from jaxtyping import Array, Float
 from wlplan.site.site import Site
 from wlplan.types import Action, Performance, Pile, Pose
 
+LEAST_MASS = 0.1
+"""Load below which M0 / M is held finite [tonne]: a bucket that comes back empty costs as much as
+about forty good ones."""
+
 
 @no_type_check
 class Transport(struct.PyTreeNode):

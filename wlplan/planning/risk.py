@@ -1,6 +1,6 @@
 """What a loading may cost beyond what is foreseen, as terms of an objective.
 
-Both ask the world that the loading is foreseen by. In a world that has played it, as the simulator
+They ask the world that the loading is foreseen by. In a world that has played it, as the simulator
 has, nothing is left open: there they count nothing.
 """
 
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from wlplan.planning.loading import Loading
+from wlplan.planning.loading import LEAST_MASS, Loading
 from wlplan.worlds.capabilities import can
 
 
@@ -52,3 +52,25 @@ class Deviation:
             return jnp.zeros_like(loading.performance.time)
         deviation = loading.world.uncertainty(loading.pile, loading.pose, loading.action)
         return jnp.asarray(deviation.time / self.time + deviation.work / self.work)
+
+
+@dataclasses.dataclass(frozen=True)
+class MassDeviation:
+    """By how much M0 / M rises if the load is a standard deviation lighter, to first order [1].
+
+    Where a model has not seen the like, as on faces steeper than those it learned from, its members
+    disagree on the load long before their mean tells; what looks best there is what they are most
+    wrong about.
+    """
+
+    needs: ClassVar[str] = "uncertainty"
+
+    reference: float = 4.29  # [tonne]
+
+    def __call__(self, loading: Loading) -> Float[Array, ""]:
+        """The term of a loading."""
+        mass = loading.performance.mass
+        if not can(loading.world, self.needs):
+            return jnp.zeros_like(mass)
+        deviation = loading.world.uncertainty(loading.pile, loading.pose, loading.action)
+        return jnp.asarray(self.reference * deviation.mass / (mass**2 + LEAST_MASS**2))

@@ -15,15 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from wlplan.planning.face import oblique, slot, undercut
-from wlplan.planning.loading import Loading
-from wlplan.planning.risk import Deviation, ExpectedStall
+from wlplan.planning.loading import LEAST_MASS, Loading
+from wlplan.planning.risk import Deviation, ExpectedStall, MassDeviation
 
 Term = Callable[[Loading], Float[Array, ""]]
 """`term(loading)`: a scalar; any function of a loading is one."""
-
-# Load below which M0 / M is held finite [tonne]: a bucket that comes back empty costs as much as
-# about forty good ones.
-_LEAST_MASS = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +31,7 @@ class InverseMass:
     def __call__(self, loading: Loading) -> Float[Array, ""]:
         """The term of a loading."""
         mass = loading.performance.mass
-        return self.reference / jnp.sqrt(mass**2 + _LEAST_MASS**2)
+        return self.reference / jnp.sqrt(mass**2 + LEAST_MASS**2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,5 +72,6 @@ TERMS: dict[str, Term] = {
     "undercut": undercut,
     "stall": ExpectedStall(),
     "deviation": Deviation(),
+    "mass_deviation": MassDeviation(),
 }
 """Terms by name."""
