@@ -65,7 +65,7 @@ class Step:
 
     @property
     def is_slow(self) -> bool:
-        """Whether it takes a core many hours."""
+        """Whether it takes a core hours."""
         adam = self.settings.optimiser == "adam"
         return self.kind == "psi_high" and adam and self.settings.epochs > 250
 
@@ -105,8 +105,6 @@ def _low(seed: int) -> Iterator[Step]:
 def _high(seed: int) -> Iterator[Step]:
     settings = PsiHighSettings(**PAPER | _HIGH, seed=seed)
     yield Step("psi_high", "as the paper says", "data", settings)
-    settings = dataclasses.replace(settings, epochs=1000)
-    yield Step("psi_high", "1,000 epochs of it", "training", settings)
     settings = dataclasses.replace(settings, epochs=250)
     yield Step("psi_high", "250 epochs of it", "training", settings)
     settings = dataclasses.replace(settings, epochs=60)
