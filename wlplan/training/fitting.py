@@ -26,7 +26,8 @@ from wlplan.training.settings import Settings
 from wlplan.types import PyTree
 
 # Part of the steps over which the learning rate rises before its cosine decay. Our choice; the
-# paper uses Adam at a constant 1e-5 for up to 2,000 epochs, which takes up to thirty times as long.
+# paper uses Adam at a constant 1e-5 for up to 2,000 epochs, which takes sixteen times as long, see
+# `experiments.protocol`.
 _WARM_UP = 0.05
 # Gradients of more than this norm are scaled down to it before AdamW.
 _LARGEST_GRADIENT = 1.0
