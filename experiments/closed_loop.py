@@ -12,7 +12,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -163,9 +163,9 @@ def run(preset: str, rows: Path) -> dict[str, Any]:
         "loads": setup.loads,
         "extent": setup.extent,
         "objective": OBJECTIVE,
-        "differences": differences(found),
-        "careful": careful(found),
-        "seconds_a_load": _seconds(found),
+        "differences": differences(found, ANEW, OPEN),
+        "careful": differences(found, CAREFUL, ((ANEW, PLACE),)),
+        "seconds_a_load": {plan: _seconds(found, plan) for plan in (ANEW, CAREFUL)},
         "cumulative": _cumulative(found),
         "rows": [{key: row[key] for key in row if key not in per_load} for row in found],
     }
@@ -352,59 +352,37 @@ _MEASURES: dict[str, Callable[[dict[str, Any]], float]] = {
 }
 
 
-def differences(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Planned after every scan against planned once, in pairs of the same pile and seed.
+def differences(
+    rows: list[dict[str, Any]], of: str, beside: Sequence[tuple[str, str]]
+) -> list[dict[str, Any]]:
+    """What a way to plan differs by from others, in pairs of the same pile and seed.
 
-    Cost, seconds a tonne and kJ a tonne, each in percent of what was planned once: means, and half
-    the interval of 95 % of the mean by Student's t; None of a single pair.
+    Cost, seconds a tonne and kJ a tonne, each in percent of the other: means, and half the interval
+    of 95 % of the mean by Student's t; None of a single pair.
+
+    Args:
+        rows: All of them.
+        of: How is planned.
+        beside: The others: how is planned, and how the loader gets to a dig there, as here.
     """
     by_name = {(r["pile"], r["condition"], r["plan"], r["drive"]): r for r in rows}
     names = list(dict.fromkeys(row["pile"] for row in rows))
     found = []
     for condition in dict.fromkeys(row["condition"] for row in rows):
-        for plan, drive in OPEN:
+        for plan, drive in beside:
             pairs = []
             for name in names:
-                anew = by_name[name, condition, ANEW, PLACE]
                 # Where the place that is told is the toe, there is one row for both.
-                anew = by_name.get((name, condition, ANEW, drive), anew)
-                pairs.append((by_name[name, condition, plan, drive], anew))
-            found.append({"condition": condition, "plan": plan, "drive": drive, **_changes(pairs)})
+                to_place = by_name[name, condition, of, PLACE]
+                own = by_name.get((name, condition, of, drive), to_place)
+                pairs.append((by_name[name, condition, plan, drive], own))
+            one = {"condition": condition, "plan": plan, "drive": drive, "pairs": len(pairs)}
+            for measure, value in _MEASURES.items():
+                change = [100.0 * (value(own) / value(other) - 1.0) for other, own in pairs]
+                one[measure] = _interval(np.array(change))
+            one["cheaper"] = sum(own["cost"] < other["cost"] for other, own in pairs)
+            found.append(one)
     return found
-
-
-def careful(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The careful objective against the usual one, both planned after every scan; as above."""
-    by_name = {(r["pile"], r["condition"], r["plan"], r["drive"]): r for r in rows}
-    piles_of: dict[str, list[str]] = {}
-    for pile, condition, plan, _ in by_name:
-        if plan == CAREFUL:
-            piles_of.setdefault(condition, []).append(pile)
-    return [
-        {
-            "condition": condition,
-            **_changes(
-                [
-                    (
-                        by_name[name, condition, ANEW, PLACE],
-                        by_name[name, condition, CAREFUL, PLACE],
-                    )
-                    for name in names
-                ]
-            ),
-        }
-        for condition, names in piles_of.items()
-    ]
-
-
-def _changes(pairs: list[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
-    """What the second of each pair differs by from the first, in percent of that."""
-    one: dict[str, Any] = {"pairs": len(pairs)}
-    for measure, value in _MEASURES.items():
-        change = [100.0 * (value(second) / value(first) - 1.0) for first, second in pairs]
-        one[measure] = _interval(np.array(change))
-    one["cheaper"] = sum(second["cost"] < first["cost"] for first, second in pairs)
-    return one
 
 
 def _interval(values: Float[np.ndarray, " n"]) -> list[float | None]:
@@ -415,18 +393,19 @@ def _interval(values: Float[np.ndarray, " n"]) -> list[float | None]:
     return [mean, round(float(stats.t.ppf(0.975, count - 1)) * error, 3)]
 
 
-def _seconds(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """How long planning a load took, see `_Timing`; quantiles over all loads [s]."""
+def _seconds(rows: list[dict[str, Any]], plan: str) -> dict[str, float]:
+    """How long planning a load took that way, see `_Timing`; quantiles over all loads [s]."""
     found: dict[str, float] = {}
+    planned = [row for row in rows if row["plan"] == plan]
     for name in ("wall", "processor"):
-        times = np.array([second for row in rows for second in row[name]])
+        times = np.array([second for row in planned for second in row[name]])
         found |= {
             f"{name}_{word}": round(float(np.quantile(times, part)), 3)
             for word, part in (("median", 0.5), ("90", 0.9), ("largest", 1.0))
         }
         found["loads"] = len(times)
-    of_planning = [row["machine_load"] for row in rows if row["wall"]]
-    return found | {"machine_load": round(float(np.mean(of_planning)), 2)}
+    loads = [row["machine_load"] for row in planned]
+    return found | {"machine_load": round(float(np.mean(loads)), 2)}
 
 
 def _cumulative(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -65,7 +65,7 @@ class Step:
 
     @property
     def is_slow(self) -> bool:
-        """Whether it takes a core hours."""
+        """Whether it takes hours."""
         adam = self.settings.optimiser == "adam"
         return self.kind == "psi_high" and adam and self.settings.epochs > 250
 

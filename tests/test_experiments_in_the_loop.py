@@ -128,12 +128,13 @@ def test_pairs_are_of_the_same_pile_and_the_interval_is_students() -> None:
         for name, cost in once.items()
         for plan, drive in closed_loop.WAYS[:-1]
     ]
-    for found in closed_loop.differences(rows):
+    for found in closed_loop.differences(rows, closed_loop.ANEW, closed_loop.OPEN):
         assert found["cost"] == pytest.approx([-5.0, 4.303 * 5.0 / math.sqrt(3.0)], rel=1e-3)
         assert (found["pairs"], found["cheaper"]) == (3, 2)
         assert found["seconds_a_tonne"] == [0.0, 0.0]
     # Careful costs here what planning once does, on one pile as much as after every scan.
-    (found,) = closed_loop.careful(rows)
+    beside = ((closed_loop.ANEW, closed_loop.PLACE),)
+    (found,) = closed_loop.differences(rows, closed_loop.CAREFUL, beside)
     assert found["cost"][0] == pytest.approx(100.0 * (1.0 / 0.9 + 1.0 / 0.95 - 2.0) / 3.0, rel=1e-3)
     assert (found["condition"], found["pairs"], found["cheaper"]) == ("noise", 3, 0)
 
