@@ -127,6 +127,23 @@ def test_a_run_leaves_the_committed_results_alone_unless_they_are_meant(
     assert (committed / "some.png").read_text() == "1.0"
 
 
+def test_how_long_a_run_took_is_not_known_where_it_went_on(
+    committed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def with_rows(preset: str, rows: Path) -> dict[str, object]:
+        rows.parent.mkdir(parents=True, exist_ok=True)
+        rows.write_text("made before\n")
+        return run(preset)
+
+    known = []
+    for _ in range(2):
+        monkeypatch.setattr(sys, "argv", ["some"])
+        record.main("some", with_rows, draw)
+        written = Path("out") / "experiments" / "full" / "some.json"
+        known.append("run_seconds" in json.loads(written.read_text())["conditions"])
+    assert known == [True, False]
+
+
 def test_a_short_run_never_replaces_what_is_committed(
     committed: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -61,8 +61,8 @@ def write_result(
         preset: Of the run.
         result: What it found.
         folder: Of results.
-        seconds: How long the run took [s], if it ran in one go. Models and rows that were there
-            before are not in it.
+        seconds: How long the run took [s], if it ran in one go. Models that were there before are
+            not in it.
     """
     took = {} if seconds is None else {"run_seconds": round(seconds, 1)}
     document = {
@@ -177,9 +177,12 @@ def _run(
         more["models"] = options.models or (folder / MODELS.name if smoke else MODELS)
     if "data" in needs:
         more["data"] = data_of(options, folder)
+    goes_on = "rows" in more and more["rows"].exists()
     start = time.perf_counter()
     result = run(options.preset, **more)
-    write_result(name, options.preset, result, folder, seconds=time.perf_counter() - start)
+    # What was made before the run was cut short took its time, too.
+    seconds = None if goes_on else time.perf_counter() - start
+    write_result(name, options.preset, result, folder, seconds=seconds)
 
 
 def redraw(name: str, draw: Callable[[Path], None], folder: Path) -> None:
