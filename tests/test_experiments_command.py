@@ -130,7 +130,7 @@ def test_a_run_leaves_the_committed_results_alone_unless_they_are_meant(
 def test_how_long_a_run_took_is_not_known_where_it_went_on(
     committed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def with_rows(preset: str, rows: Path) -> dict[str, object]:
+    def with_rows(preset: str, rows: Path) -> dict[str, float]:
         rows.parent.mkdir(parents=True, exist_ok=True)
         rows.write_text("made before\n")
         return run(preset)
